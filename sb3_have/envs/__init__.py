@@ -1,0 +1,16 @@
+"""Environments. Importing this package registers ``HighwayVision-v0`` with gymnasium."""
+
+from gymnasium.envs.registration import WrapperSpec, register, registry
+
+from sb3_have.envs.highway_vision import HighwayVisionEnv
+
+__all__ = ["HighwayVisionEnv"]
+
+if "HighwayVision-v0" not in registry:
+    register(
+        id="HighwayVision-v0",
+        entry_point="sb3_have.envs.highway_vision:HighwayVisionEnv",
+        max_episode_steps=500,
+        kwargs={"max_episode_steps": None},  # gymnasium counts, see ReportTimeout
+        additional_wrappers=(WrapperSpec("ReportTimeout", "sb3_have.envs.highway_vision:ReportTimeout", {}),),
+    )

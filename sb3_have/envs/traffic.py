@@ -1,0 +1,84 @@
+"""The other vehicles of a highway: IDM/MOBIL drivers in a window that moves with the ego vehicle.
+
+The window reaches from :data:`BEHIND` to :data:`AHEAD`. Who leaves it at one end comes back at the other, in a random
+lane with a random speed, so the ego vehicle never runs out of traffic and the density stays what it was. Both ends
+are out of sight: the camera looks forward, and at :data:`SIGHT` a car is less than a pixel wide.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from highway_env.road.road import Road
+from highway_env.vehicle.behavior import IDMVehicle
+from highway_env.vehicle.kinematics import Vehicle
+
+SIGHT = 300.0
+"""No vehicle appears nearer than this ahead of the ego vehicle [m]."""
+AHEAD = SIGHT + 20.0
+"""Front end of the window, ahead of the ego vehicle [m]; arrivals are spread over the last 20 m."""
+BEHIND = 120.0
+"""Rear end of the window, behind the ego vehicle [m]; arrivals are spread over the last 20 m."""
+SPEED_RANGE = (21.0, 24.0)
+"""Range of the desired speeds [m/s], highway-env's 70 to 80% of its 30 m/s limit."""
+
+
+def populate(road: Road, ego: Vehicle, count: int, rng: np.random.Generator, tries: int = 100) -> None:
+    """Add ``count`` vehicles to the road, uniformly over the window, with room to everyone around.
+
+    Room means that nobody starts nearer to the one in front than the gap IDM itself wants, at the speeds of both; for
+    an ego vehicle at rest that leaves followers in its lane about 120 m to stop. On a road too full for that the
+    rest queues ahead of the window and comes in through its rear end when there is room.
+
+    :param road: holds the ego vehicle already
+    :param ego: the ego vehicle
+    :param count: number of vehicles to add
+    :param rng: source of all randomness
+    :param tries: how often a place is drawn for each vehicle
+    """
+    for i in range(count):
+        for _ in range(tries):
+            vehicle = _random_vehicle(road, ego.position[0] + rng.uniform(-BEHIND, AHEAD), rng)
+            if _has_room(vehicle):
+                break
+        else:
+            vehicle = _random_vehicle(road, ego.position[0] + AHEAD + 50.0 * (i + 1), rng)
+        road.vehicles.append(vehicle)
+
+
+def recycle(road: Road, ego: Vehicle, rng: np.random.Generator) -> list[int]:
+    """Bring vehicles that left the window at one end back at the other, where there is room; the rest waits.
+
+    :param road: its ``vehicles`` keep their order, a recycled one is replaced in place
+    :param ego: the ego vehicle, never recycled
+    :param rng: source of all randomness
+    :return: indices into ``road.vehicles`` of the vehicles that were replaced
+    """
+    replaced = []
+    for i, vehicle in enumerate(road.vehicles):
+        offset = vehicle.position[0] - ego.position[0]
+        if vehicle is ego or -BEHIND <= offset <= AHEAD:
+            continue
+        arrival = rng.uniform(SIGHT, AHEAD) if offset < 0 else rng.uniform(-BEHIND, -BEHIND + AHEAD - SIGHT)
+        newcomer = _random_vehicle(road, ego.position[0] + arrival, rng)
+        if _has_room(newcomer):
+            road.vehicles[i] = newcomer
+            replaced.append(i)
+    return replaced
+
+
+def _random_vehicle(road: Road, x: float, rng: np.random.Generator) -> IDMVehicle:
+    lanes = road.network.all_side_lanes(("0", "1", 0))
+    vehicle = IDMVehicle.make_on_lane(road, lanes[rng.integers(len(lanes))], x, rng.uniform(*SPEED_RANGE))
+    vehicle.DELTA = rng.uniform(*IDMVehicle.DELTA_RANGE)
+    return vehicle
+
+
+def _has_room(vehicle: IDMVehicle) -> bool:
+    """Whether the gaps in front of and behind a vehicle are what IDM wants (and never under two car lengths)."""
+    front, rear = vehicle.road.neighbour_vehicles(vehicle)
+    pairs = [(vehicle, front), (rear, vehicle)]
+    return all(
+        follower.lane_distance_to(leader) >= max(vehicle.desired_gap(follower, leader), 2 * vehicle.LENGTH)
+        for follower, leader in pairs
+        if follower is not None and leader is not None
+    )
