@@ -1,0 +1,240 @@
+"""The sensors of a car: poses in, the observation of a colour camera, an event camera and a depth camera out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, get_args
+
+import cv2
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from sb3_have.envs.camera import PAINTS, Camera, Objects
+from sb3_have.envs.weather import Illumination, rain_events, take_picture, weather_by_name
+from sb3_have.sensors.depth import encode_depth
+from sb3_have.sensors.event_camera import EventCamera
+from sb3_have.sensors.representations import EVENT_ZERO, Representation, decode_events, encode_events, represent
+
+Array = NDArray[np.floating]
+Observation = dict[str, NDArray[np.uint8]]
+
+MODALITIES: Final = ("rgb", "event", "depth")
+#: Defaults of the event camera. ``log_eps`` lies far below the light of a night, where noon is about 1.
+EVENT_DEFAULTS: Final[Mapping[str, Any]] = {
+    "bins": 5,
+    "subframes": 5,
+    "representation": "sbt",
+    "threshold": 0.2,
+    "threshold_sigma": 0.03,
+    "refractory": 0.0,
+    "leak_rate": 0.0,
+    "shot_rate": 0.0,
+    "mapping": "log",
+    "log_eps": 1e-7,
+    "seed": 0,
+}
+DEPTH_DEFAULTS: Final[Mapping[str, Any]] = {"encoding": "log", "max": 100.0}
+
+
+class VisionSensors:
+    """
+    Roof camera, event camera and depth camera of the ego vehicle on a straight road.
+
+    Only what the chosen modalities need is computed: an event camera needs several instants of each control step, the
+    others only the last.
+
+    :param image_size: Rows and columns of every image.
+    :param modalities: Non-empty subset of ``"rgb"``, ``"event"``, ``"depth"``.
+    :param lanes_count: Lanes of the road; the centre of lane k lies at y = k * lane_width, y to the right.
+    :param lane_width: In metres.
+    :param event: Overrides of :data:`EVENT_DEFAULTS`: ``bins`` (channels), ``subframes`` (instants rendered per control
+        step), ``representation`` ("sbt", "voxel", "count") and the parameters of
+        :class:`~sb3_have.sensors.EventCamera`. ``seed`` fixes the chip's threshold mismatch; all noise comes from the
+        generators given to :meth:`reset` and :meth:`observe`. With a ``mapping`` other than "log" the event camera
+        sees the digital numbers of the colour camera, neither clipped nor rounded.
+    :param depth: Overrides of :data:`DEPTH_DEFAULTS`: ``encoding`` ("log", "clipped", "inverse") and ``max`` in metres.
+    :raises ValueError: on an unknown modality, option or value.
+    """
+
+    def __init__(
+        self,
+        image_size: int = 84,
+        modalities: Sequence[str] = MODALITIES,
+        lanes_count: int = 4,
+        lane_width: float = 4.0,
+        event: Mapping[str, Any] | None = None,
+        depth: Mapping[str, Any] | None = None,
+    ) -> None:
+        if isinstance(modalities, str) or not modalities or not set(modalities) <= set(MODALITIES):
+            raise ValueError(f"modalities must be a non-empty subset of {MODALITIES}, got {modalities!r}")
+        if image_size < 16:
+            raise ValueError(f"image_size must be at least 16, got {image_size}")
+        if lanes_count < 1 or not lane_width > 0:
+            raise ValueError(f"need lanes_count >= 1 and lane_width > 0, got {lanes_count} and {lane_width}")
+        self.image_size = image_size
+        self.modalities = tuple(name for name in MODALITIES if name in modalities)
+        self.event_options = _options("event", EVENT_DEFAULTS, event)
+        self.depth_options = _options("depth", DEPTH_DEFAULTS, depth)
+        encode_depth(np.empty(0), *self.depth_options.values())  # complains about a wrong option now, not at reset
+        self.camera = Camera(image_size, lanes_count, lane_width)
+
+        chip = dict(self.event_options)
+        self.bins, self.subframes = int(chip.pop("bins")), int(chip.pop("subframes"))
+        self._representation = chip.pop("representation")
+        if self.bins < 1 or self.subframes < 1:
+            raise ValueError(f"event bins and subframes must be at least 1, got {self.bins} and {self.subframes}")
+        self.event_camera = EventCamera(image_size, image_size, **chip)
+        if self._representation not in get_args(Representation):
+            known = get_args(Representation)
+            raise ValueError(f"event representation must be one of {known}, got {self._representation!r}")
+
+        channels = {"rgb": 3, "event": self.bins, "depth": 1}
+        #: Space of each modality: uint8 (image_size, image_size, channels).
+        self.spaces: dict[str, spaces.Box] = {
+            name: spaces.Box(0, 255, (image_size, image_size, channels[name]), np.uint8) for name in self.modalities
+        }
+        self._sizes: Array | None = None
+        self._view: Objects | None = None
+        self._time = 0.0
+
+    def reset(self, weather: str, poses: Array, sizes: Array, rng: np.random.Generator) -> Observation:
+        """
+        Start an episode.
+
+        :param weather: One of :data:`~sb3_have.envs.weather.WEATHERS`.
+        :param poses: (1 + vehicles, 3): x, y in metres and heading in radians; row 0 is the ego.
+        :param sizes: (1 + vehicles, 2): length and width in metres, for the whole episode.
+        :param rng: Source of the vehicles' paints and of the noise.
+        :return: An image per modality; the event image is empty (all 128).
+        :raises ValueError: on an unknown weather or wrong shapes.
+        """
+        self.weather = weather_by_name(weather)
+        sizes = np.asarray(sizes, dtype=np.float64)
+        if sizes.ndim != 2 or sizes.shape[1] != 2 or len(sizes) < 1:
+            raise ValueError(f"sizes must have shape (1 + vehicles, 2), got {sizes.shape}")
+        self._sizes = sizes
+        poses = self._check(np.asarray(poses)[None])
+        paint = rng.integers(len(PAINTS), size=len(sizes) - 1)
+        self._colour = Illumination(self.weather, self.camera, paint, colour=True)
+        self._brightness = Illumination(self.weather, self.camera, paint, colour=False)
+        self._time = 0.0
+        self.event_camera.reset()
+        return self._sense(poses, 0.0, rng)
+
+    def observe(self, poses: Array, duration: float, rng: np.random.Generator) -> Observation:
+        """
+        What the sensors deliver at the end of a control step.
+
+        :param poses: (instants, 1 + vehicles, 3), two or more equally spaced instants of the step; the first is its
+            start, the last is now. Vehicles keep their row through the episode.
+        :param duration: Length of the step in seconds.
+        :param rng: Source of the noise.
+        :return: An image per modality.
+        :raises ValueError: on wrong shapes or a duration that is not positive.
+        :raises RuntimeError: before the first :meth:`reset`.
+        """
+        poses = self._check(np.asarray(poses))
+        if len(poses) < 2 or not duration > 0:
+            raise ValueError(f"need at least 2 instants and a positive duration, got {len(poses)} and {duration}")
+        if "event" in self.modalities:
+            at = np.arange(1, self.subframes + 1) * ((len(poses) - 1) / self.subframes)
+            before = np.minimum(at.astype(int), len(poses) - 2)
+            share = (at - before)[:, None, None]
+            poses = (1 - share) * poses[before] + share * poses[before + 1]
+        else:
+            poses = poses[-1:]
+        return self._sense(poses, duration, rng)
+
+    @property
+    def last_truth(self) -> dict[str, NDArray[Any]]:
+        """
+        What the last observation was made from: ``depth`` (float32 metres, infinite in the sky) and ``vehicle``, the
+        number of the traffic vehicle (its row in the poses less one) that a pixel sees, or -1. (image_size, image_size).
+        """
+        if self._view is None:
+            raise RuntimeError("no observation yet: call reset() first")
+        last = self._view
+        far_to_near = np.argsort(-last.depth, kind="stable")
+        vehicle = np.full(self.image_size**2, -1)
+        vehicle[last.pixel[far_to_near]] = last.face_vehicle[last.face[far_to_near]]
+        return {
+            "depth": self.camera.depth(last),
+            "vehicle": vehicle.reshape(self.image_size, self.image_size),
+        }
+
+    def _check(self, poses: Array) -> Array:
+        if self._sizes is None:
+            raise RuntimeError("call reset() before observe()")
+        poses = np.asarray(poses, dtype=np.float64)
+        if poses.ndim != 3 or poses.shape[1:] != (len(self._sizes), 3):
+            raise ValueError(f"poses must have shape (..., {len(self._sizes)}, 3) as at reset, got {poses.shape[-2:]}")
+        return poses
+
+    def _sense(self, poses: Array, duration: float, rng: np.random.Generator) -> Observation:
+        objects = self.camera.objects(poses, self._sizes)
+        self._view = last = objects.last(len(poses), self.image_size**2)
+        observation: Observation = {}
+        if "rgb" in self.modalities:
+            ground = self.camera.ground(poses[-1:])
+            observation["rgb"] = take_picture(self._colour.render(ground, last)[0], self.weather, rng)
+        if "event" in self.modalities:
+            ground = self.camera.ground(poses)
+            observation["event"] = self._events(self._brightness.render(ground, objects)[..., 0], duration, rng)
+        if "depth" in self.modalities:
+            depth = self.camera.depth(last)
+            observation["depth"] = encode_depth(depth, *self.depth_options.values())[..., None]
+        return observation
+
+    def _events(self, frames: Array, duration: float, rng: np.random.Generator) -> NDArray[np.uint8]:
+        """Event image of the brightness frames of one step; at reset (duration 0) there is one frame and no event."""
+        if self.event_options["mapping"] != "log":
+            frames = frames * (255 * self.weather.exposure)
+        size, start = self.image_size, self._time
+        times = [start + duration * (k + 1) / len(frames) for k in range(len(frames))]
+        parts = [self.event_camera.detect(frame, t, rng) for frame, t in zip(frames, times)]
+        if duration == 0:
+            return np.full((size, size, self.bins), EVENT_ZERO, dtype=np.uint8)
+        self._time = times[-1]
+        if self.weather.rain:
+            parts.append(rain_events(self.weather, start, self._time, size, size, rng))
+        pixel, time, polarity = (np.concatenate(part) for part in zip(*parts))
+        counts = represent(pixel, time, polarity, self.bins, start, self._time, size, size, self._representation)
+        return encode_events(counts)
+
+
+def _options(name: str, defaults: Mapping[str, Any], given: Mapping[str, Any] | None) -> dict[str, Any]:
+    unknown = set(given or {}) - set(defaults)
+    if unknown:
+        raise ValueError(f"unknown {name} option {sorted(unknown)}; the options are {', '.join(defaults)}")
+    return {**defaults, **(given or {})}
+
+
+def compose(observation: Mapping[str, NDArray[np.uint8]], scale: int = 4) -> NDArray[np.uint8]:
+    """
+    One picture of an observation, RGB | event | depth from left to right, for people to look at.
+
+    :param observation: Any non-empty subset of the modalities, (H, W, C) uint8 each.
+    :param scale: Pixels on the screen per pixel of the image.
+    :return: uint8 (H * scale, W * scale * modalities, 3). Events: red brighter, blue darker, on white. Depth:
+        near yellow, far violet, no data black.
+    """
+    shown = [_PAINTERS[name](np.asarray(observation[name])) for name in MODALITIES if name in observation]
+    if not shown:
+        raise ValueError(f"observation has none of {MODALITIES}, only {sorted(observation)}")
+    return np.concatenate(shown, axis=1).repeat(scale, axis=0).repeat(scale, axis=1)
+
+
+def _paint_events(codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    total = decode_events(codes).sum(axis=-1)
+    strength = np.clip(np.abs(total) / 4, 0, 1)[..., None]
+    colour = np.where(total[..., None] > 0, (214.0, 39.0, 40.0), (31.0, 119.0, 220.0))
+    return np.asarray(255 + strength * (colour - 255)).astype(np.uint8)
+
+
+def _paint_depth(codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    coloured = cv2.applyColorMap(255 - codes[..., -1], cv2.COLORMAP_INFERNO)[..., ::-1]
+    return np.asarray(np.where(codes[..., -1:] == 0, 0, coloured)).astype(np.uint8)
+
+
+_PAINTERS: Final = {"rgb": lambda image: image[..., -3:], "event": _paint_events, "depth": _paint_depth}

@@ -1,0 +1,318 @@
+"""Eight weathers: how much light falls on a scene, what the air does to it, and how a colour camera takes it.
+
+Light is linear and unclipped, in units in which a white surface under a clear noon sky has irradiance 1. A night lies
+three to four orders of magnitude lower. The colour camera has to choose an exposure and clips and quantises; an event
+camera works on the logarithm and hardly notices.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_have.envs.camera import ALBEDO, ASPHALT, LAMP, MARKING, PAINTS, VERGE, Camera, Ground, Objects
+
+Array = NDArray[np.floating]
+Colour = tuple[float, float, float]
+
+#: Weights of red, green and blue in the brightness that a monochrome (event) pixel sees.
+LUMA: Final = np.array((0.299, 0.587, 0.114), dtype=np.float32)
+
+
+@dataclass(frozen=True)
+class Weather:
+    """
+    One weather.
+
+    :param sun: Irradiance from the sun (or moon) on a surface that faces it.
+    :param ambient: Irradiance from the sky on a horizontal surface.
+    :param zenith: Radiance of the sky above.
+    :param horizon: Radiance of the sky at the horizon, and of fog.
+    :param exposure: Digital value (1 = full well) of a white surface per unit of radiance.
+    :param wetness: 0 (dry) to 1 (standing water): the road darkens and mirrors the sky.
+    :param extinction: Share of light lost per metre to rain and mist.
+    :param rain: 0 (none) to 1 (hard): streaks in the colour image, false events.
+    :param night: The ego's headlights and everybody's tail lights are on.
+    """
+
+    sun: Colour
+    ambient: Colour
+    zenith: Colour
+    horizon: Colour
+    exposure: float
+    wetness: float = 0.0
+    extinction: float = 0.0
+    rain: float = 0.0
+    night: bool = False
+
+
+def _night(level: float, warmth: float = 0.0) -> Colour:
+    """Faint light, bluish under a clear sky, warmer where clouds throw back the light of towns."""
+    return (level * (0.75 + 0.45 * warmth), level * (0.9 + 0.1 * warmth), level * (1.25 - 0.45 * warmth))
+
+
+CLEAR_NOON: Final = Weather(
+    sun=(0.82, 0.80, 0.74),
+    ambient=(0.17, 0.20, 0.27),
+    zenith=(0.16, 0.30, 0.58),
+    horizon=(0.44, 0.54, 0.66),
+    exposure=1.0,
+)
+_WEATHERS: Final = {
+    "ClearNight": Weather(
+        sun=_night(1.2e-4),
+        ambient=_night(1.5e-4),
+        zenith=_night(5e-5),
+        horizon=_night(1.5e-4),
+        exposure=40.0,
+        night=True,
+    ),
+    "CloudyNight": Weather(
+        sun=(0.0, 0.0, 0.0),
+        ambient=_night(3.5e-4, 1.0),
+        zenith=_night(2.5e-4, 1.0),
+        horizon=_night(6e-4, 1.0),
+        exposure=40.0,
+        night=True,
+    ),
+    "HardRainNight": Weather(
+        sun=(0.0, 0.0, 0.0),
+        ambient=_night(2.5e-4, 0.5),
+        zenith=_night(1.5e-4, 0.5),
+        horizon=_night(3e-4, 0.5),
+        exposure=40.0,
+        wetness=1.0,
+        extinction=0.006,
+        rain=1.0,
+        night=True,
+    ),
+    "WetNight": Weather(
+        sun=_night(0.8e-4),
+        ambient=_night(2e-4, 0.2),
+        zenith=_night(1e-4, 0.2),
+        horizon=_night(2.5e-4, 0.2),
+        exposure=40.0,
+        wetness=0.7,
+        night=True,
+    ),
+    "ClearNoon": CLEAR_NOON,
+    "CloudyNoon": Weather(
+        sun=(0.0, 0.0, 0.0),
+        ambient=(0.40, 0.41, 0.43),
+        zenith=(0.36, 0.37, 0.40),
+        horizon=(0.44, 0.45, 0.47),
+        exposure=1.5,
+    ),
+    "HardRainNoon": Weather(
+        sun=(0.0, 0.0, 0.0),
+        ambient=(0.19, 0.20, 0.22),
+        zenith=(0.15, 0.16, 0.18),
+        horizon=(0.22, 0.23, 0.25),
+        exposure=2.2,
+        wetness=1.0,
+        extinction=0.010,
+        rain=1.0,
+    ),
+    "WetNoon": Weather(
+        sun=(0.50, 0.48, 0.42),
+        ambient=(0.22, 0.24, 0.28),
+        zenith=(0.24, 0.33, 0.50),
+        horizon=(0.55, 0.56, 0.55),
+        exposure=1.15,
+        wetness=0.7,
+        extinction=0.002,
+    ),
+}
+#: Names of the eight weathers, as in the paper.
+WEATHERS: Final[tuple[str, ...]] = tuple(_WEATHERS)
+
+
+def weather_by_name(name: str) -> Weather:
+    """
+    :param name: One of :data:`WEATHERS`.
+    :raises ValueError: on any other name.
+    """
+    if name not in _WEATHERS:
+        raise ValueError(f"unknown weather {name!r}; the weathers are {', '.join(WEATHERS)}")
+    return _WEATHERS[name]
+
+
+#: Unit vector towards the sun (forward, right, up): high, behind the ego and to its left, so rear faces are lit.
+SUN_DIRECTION: Final = np.array((-0.45, -0.30, 0.84))
+#: The sun's rays reach a vertical face under this share of the sky.
+SKY_ON_WALLS: Final = 0.55
+#: Low beam: irradiance at 1 m, reach in metres, half-width of the beam as tan(angle).
+HEADLIGHT: Final = 0.9
+HEADLIGHT_COLOUR: Final[Colour] = (1.0, 0.94, 0.80)
+HEADLIGHT_REACH: Final = 13.0
+HEADLIGHT_WIDTH: Final = 0.28
+#: Radiance of a tail light.
+TAIL_LIGHT: Final[Colour] = (6e-4, 4e-5, 3e-5)
+#: False events per pixel and second in the hardest rain.
+RAIN_EVENT_RATE: Final = 4.0
+
+
+@dataclass
+class Illumination:
+    """
+    A weather seen through a camera: all that does not depend on the vehicles, computed once per episode.
+
+    :param weather: The weather.
+    :param camera: The camera.
+    :param paint: Index into ``PAINTS`` of every traffic vehicle.
+    :param colour: True for red, green and blue; False for brightness alone.
+    """
+
+    weather: Weather
+    camera: Camera
+    paint: NDArray[np.int64]
+    colour: bool
+    albedo: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        weather, camera = self.weather, self.camera
+        self.sun, self.ambient, self.horizon = map(self._light, (weather.sun, weather.ambient, weather.horizon))
+        self.beam = self._light(HEADLIGHT_COLOUR) * np.float32(HEADLIGHT * weather.night)
+        self.tail = self._light(TAIL_LIGHT) * np.float32(weather.night)
+        self.albedo = self._light(np.concatenate((ALBEDO, PAINTS[self.paint])))
+        wet = np.float32(1 - 0.45 * weather.wetness)
+        self.asphalt, self.marking = self._light(ASPHALT) * wet, self._light(MARKING) * (0.5 + 0.5 * wet)
+        self.verge = self._light(VERGE) * (0.5 + 0.5 * wet)
+
+        # Sky: darker or bluer towards the zenith.
+        zenith = self._light(weather.zenith)
+        up = np.clip(-camera.slope[: camera.horizon] / 0.6, 0, 1)[:, None, None] ** np.float32(0.7)
+        self.sky = self.horizon + up * (zenith - self.horizon)
+
+        # Ground: light that falls on it, and the haze and the sky's mirror image that lie over it.
+        forward = camera.ground_forward[..., None]
+        self.haze = np.exp(-np.float32(weather.extinction) * forward)
+        flat = self.ambient + self.sun * np.float32(SUN_DIRECTION[2])
+        beam = self._beam(forward, camera.slope[None, :, None]) * np.minimum(1, 6 / forward)
+        self.ground_light = (flat + beam * self.beam) * self.haze
+        grazing = camera.height / np.hypot(camera.height, forward)
+        mirror = np.float32(weather.wetness) * (0.02 + 0.6 * (1 - grazing) ** 5)
+        self.mirror = self.horizon * mirror * self.haze * np.float32(0.6)
+
+    def _light(self, value: Array | Colour) -> Array:
+        """Colour channels, or their brightness, along the last axis."""
+        channels = np.asarray(value, dtype=np.float32)
+        return channels if self.colour else (channels @ LUMA)[..., None]
+
+    def _beam(self, forward: Array, tangent: Array) -> Array:
+        """Share of the headlights' light at a distance and tan(angle), on a surface facing them."""
+        reach = np.exp(-((forward / np.float32(HEADLIGHT_REACH)) ** 2)) / (1 + (forward / 6) ** 2)
+        return np.asarray(reach * np.exp(-((tangent / np.float32(HEADLIGHT_WIDTH)) ** 2)))
+
+    def render(self, ground: Ground, objects: Objects) -> Array:
+        """
+        Irradiance of every pixel.
+
+        :param ground: From :meth:`Camera.ground`.
+        :param objects: From :meth:`Camera.objects`, of the same instants.
+        :return: float32 (instants, height, width, 3 or 1), linear, >= 0, unclipped.
+        """
+        camera = self.camera
+        instants = len(ground.road)
+        road, marking, verge = (share[..., None] for share in (ground.road, ground.marking, ground.verge))
+        surface = self.asphalt + marking * (self.marking - self.asphalt)
+        verge = verge * self.verge
+        below = (verge + road * (surface - verge)) * self.ground_light
+        below += road * self.mirror + self.horizon * (1 - self.haze)
+        image = np.empty((instants, camera.size, camera.size, below.shape[-1]), dtype=np.float32)
+        image[:, : camera.horizon] = self.sky
+        image[:, camera.horizon :] = below
+
+        shade = self._shade(objects)
+        flat = image.reshape(-1, image.shape[-1])
+        samples = np.float32(1 / 4)
+        cover = np.bincount(objects.pixel, minlength=len(flat))
+        hit = np.flatnonzero(cover)
+        flat[hit] *= 1 - cover[hit, None].astype(np.float32) * samples
+        for channel in range(flat.shape[1]):
+            total = np.bincount(objects.pixel, weights=shade[:, channel], minlength=len(flat))
+            flat[hit, channel] += total[hit].astype(np.float32) * samples
+        return image
+
+    def _shade(self, objects: Objects) -> Array:
+        """Radiance of the object samples, (samples, channels)."""
+        facing = np.clip(objects.face_normal @ SUN_DIRECTION[:2], 0, None).astype(np.float32)
+        light = self.ambient * np.float32(SKY_ON_WALLS) + facing[:, None] * self.sun
+        haze = np.exp(-np.float32(self.weather.extinction) * objects.depth)[:, None]
+        received = light[objects.face]
+        if self.weather.night:
+            tangent = self.camera.slope[objects.pixel % self.camera.size]
+            received = received + self._beam(objects.depth, tangent)[:, None] * self.beam
+        radiance = self.albedo[objects.material] * received
+        if self.weather.night:
+            radiance[objects.material == LAMP] += self.tail
+        return np.asarray(radiance * haze + self.horizon * (1 - haze))
+
+
+#: The colour camera: electrons in a full pixel, read noise in electrons, steps of the converter.
+FULL_WELL: Final = 9000.0
+READ_NOISE: Final = 6.0
+ADC_STEPS: Final = 4095
+GAMMA: Final = 2.2
+_GAMMA_TABLE: Final = np.rint(255 * (np.arange(ADC_STEPS + 1) / ADC_STEPS) ** (1 / GAMMA)).astype(np.uint8)
+
+
+def take_picture(radiance: Array, weather: Weather, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """
+    The colour camera: fixed exposure, photon and read noise, 12-bit conversion, gamma, 8 bits; rain streaks.
+
+    :param radiance: float32 (height, width, 3), linear.
+    :param weather: The weather, for exposure and rain.
+    :param rng: Source of the noise.
+    :return: uint8 (height, width, 3).
+    """
+    if weather.rain:
+        radiance = radiance + _streaks(radiance.shape[0], weather, rng)[..., None] * radiance.mean(axis=(0, 1))
+    electrons = radiance * np.float32(weather.exposure * FULL_WELL)
+    noise = rng.standard_normal(electrons.shape, dtype=np.float32)
+    electrons += noise * np.sqrt(electrons + np.float32(READ_NOISE**2))
+    digital = np.clip(electrons * np.float32(ADC_STEPS / FULL_WELL), 0, ADC_STEPS).astype(np.int16)
+    return np.asarray(_GAMMA_TABLE[digital])
+
+
+def _streaks(size: int, weather: Weather, rng: np.random.Generator) -> NDArray[np.float32]:
+    """Falling drops, blurred by the exposure into faint lines: brightness added, as a share of the mean."""
+    streaks = np.zeros((size, size), dtype=np.float32)
+    count = rng.poisson(0.5 * size * weather.rain)
+    start = rng.uniform(0, size, (count, 2))
+    length = rng.uniform(0.05, 0.15, count) * size
+    end = start + np.stack((0.15 * length, length), axis=-1)
+    strength = rng.uniform(0.03, 0.12, count)
+    for (x0, y0), (x1, y1), brightness in zip(start.astype(int).tolist(), end.astype(int).tolist(), strength.tolist()):
+        cv2.line(streaks, (x0, y0), (x1, y1), brightness)
+    return streaks
+
+
+def rain_events(
+    weather: Weather, t0: float, t1: float, height: int, width: int, rng: np.random.Generator
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """
+    False events of drops that cross the view within microseconds: short vertical runs of one polarity.
+
+    :param weather: The weather; no rain, no events.
+    :param t0: Start of the interval in seconds.
+    :param t1: End of the interval in seconds.
+    :return: Pixel index, time and polarity, as :meth:`EventCamera.detect` returns them.
+    """
+    run = max(2, height // 24)
+    rate = weather.rain * RAIN_EVENT_RATE * height * width / run
+    drops = int(rng.poisson(rate * (t1 - t0))) if rate else 0
+    column = rng.integers(width, size=drops)
+    row = rng.integers(1 - run, height, size=drops)
+    time = rng.uniform(t0, t1, drops)
+    # A drop is a lens that shows the sky: it brightens more often than it darkens.
+    polarity = np.where(rng.random(drops) < 0.65, 1.0, -1.0)
+    rows = row[:, None] + np.arange(run)
+    inside = (rows >= 0) & (rows < height)
+    pixel = (rows * width + column[:, None])[inside]
+    repeats = inside.sum(axis=1)
+    return pixel, np.repeat(time, repeats), np.repeat(polarity, repeats)
