@@ -1,0 +1,233 @@
+"""From a Dict of raw observations to one feature vector per modality."""
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch as th
+import torch.nn.functional as F
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+EVENT_SCALE = 1 / 8  # one event is 0.125, about the contrast of a clearly visible edge in an image scaled to [0, 1]
+PAPER_ENCODER_MIN_SIZE = 112  # px; from here on an image gets the paper's encoder, below a Nature-style one
+
+
+class ImageEncoder(nn.Module):
+    """
+    Convolutions, a linear layer and a LayerNorm: (batch, channels, height, width) float to (batch, features_dim).
+
+    :param observation_space: Box of shape (channels, height, width)
+    :param features_dim: size of the features
+    :param layers: (filters, kernel size, stride) of each convolution; None chooses by the image's size: the
+        four 3x3 layers of the paper (as in SAC-AE, Yarats et al. 2021) from 112 pixels on, the three layers of the
+        Nature DQN (Mnih et al. 2015) from 36 on, three 3x3 layers below.
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Box,
+        features_dim: int = 50,
+        layers: Sequence[tuple[int, int, int]] | None = None,
+    ):
+        super().__init__()
+        channels, height, width = observation_space.shape
+        if layers is None:
+            layers = default_layers(min(height, width))
+        modules: list[nn.Module] = []
+        for filters, kernel_size, stride in layers:
+            modules += [nn.Conv2d(channels, filters, kernel_size, stride), nn.ReLU()]
+            channels = filters
+        self.convolutions = nn.Sequential(*modules, nn.Flatten())
+        with th.no_grad():
+            n_flatten = self.convolutions(th.zeros(1, *observation_space.shape)).shape[1]
+        self.projection = nn.Sequential(nn.Linear(n_flatten, features_dim), nn.LayerNorm(features_dim))
+        self.to(memory_format=th.channels_last)  # type: ignore[call-overload]
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        features: th.Tensor = self.projection(
+            self.convolutions(observations.contiguous(memory_format=th.channels_last))
+        )
+        return features
+
+
+def default_layers(size: int) -> list[tuple[int, int, int]]:
+    """(filters, kernel size, stride) of the convolutions for an image whose shorter side is ``size`` pixels."""
+    if size >= PAPER_ENCODER_MIN_SIZE:
+        return [(32, 3, 2), (32, 3, 1), (32, 3, 1), (32, 3, 1)]
+    if size >= 36:
+        return [(32, 8, 4), (64, 4, 2), (64, 3, 1)]
+    if size >= 15:
+        return [(32, 3, 2), (64, 3, 2), (64, 3, 1)]
+    raise ValueError(
+        f"The default image encoders need at least 15x15 pixels, got {size}: enlarge the image, "
+        "or give `encoder_kwargs={<modality>: dict(layers=[(filters, kernel_size, stride), ...])}` in `policy_kwargs`."
+    )
+
+
+class VectorEncoder(nn.Module):
+    """
+    A multi-layer perceptron and a LayerNorm: (batch, n) float to (batch, features_dim).
+
+    :param observation_space: Box of shape (n,)
+    :param features_dim: size of the features
+    :param net_arch: widths of the hidden layers
+    """
+
+    def __init__(self, observation_space: spaces.Box, features_dim: int = 50, net_arch: Sequence[int] = (64,)):
+        super().__init__()
+        widths = [int(np.prod(observation_space.shape)), *net_arch]
+        hidden = [module for n_in, n_out in pairwise(widths) for module in (nn.Linear(n_in, n_out), nn.ReLU())]
+        self.net = nn.Sequential(*hidden, nn.Linear(widths[-1], features_dim), nn.LayerNorm(features_dim))
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        features: th.Tensor = self.net(observations)
+        return features
+
+
+class Modality(NamedTuple):
+    """One group of observation keys that share an encoder."""
+
+    keys: tuple[str, ...]
+    space: spaces.Box
+    is_image: bool
+
+
+class MultiModalEncoder(nn.Module):
+    """
+    One encoder per modality: z_i = Enc_i(o_i), stacked to (batch, d, features_dim).
+
+    Raw observations are decoded here, by fixed scales and never by statistics of the batch, so that acting and
+    training see the same numbers: uint8 images are divided by 255; images of signed counts (128 = none, as the event
+    camera's) become ``(value - 128) / 8`` with 0 standing for "no data", which decodes to 0 like "no event" (frame
+    stacking pads with zeros at reset); vectors and, with ``normalize_images=False``, all images are taken as they are.
+
+    :param observation_space: Dict of Boxes (images channel-first), or one Box, a single modality named ``observation``
+    :param features_dim: F, the size of each modality's features
+    :param modalities: keys of each modality, e.g. ``{"vision": ["rgb", "depth"], "event": ["event"]}``; the keys of a
+        modality are all images of one size or all vectors. By default every key is a modality of its own.
+    :param encoder_classes: an own encoder for some modalities, called as ``cls(space, features_dim=F, **kwargs)``;
+        SB3's features extractors fit
+    :param encoder_kwargs: keyword arguments for the encoder of some modalities
+    :param signed_keys: image keys holding signed counts around 128; by default those with "event" in their name
+    :param normalize_images: whether to decode images as above
+    :raises ValueError: for a space, key or modality that cannot be encoded; the message names it and the remedy
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        features_dim: int = 50,
+        modalities: Mapping[str, Sequence[str]] | None = None,
+        encoder_classes: Mapping[str, type[nn.Module]] | None = None,
+        encoder_kwargs: Mapping[str, Mapping[str, Any]] | None = None,
+        signed_keys: Sequence[str] | None = None,
+        normalize_images: bool = True,
+    ):
+        super().__init__()
+        if not isinstance(observation_space, spaces.Dict):
+            observation_space = spaces.Dict({"observation": observation_space})
+        keys = list(observation_space.spaces)
+        if modalities is None:
+            modalities = {key: [key] for key in keys}
+        self.modalities = {
+            name: _make_modality(name, group, observation_space, normalize_images) for name, group in modalities.items()
+        }
+        if not self.modalities:
+            raise ValueError("`modalities` is empty: name at least one modality and its observation keys.")
+        encoder_classes, encoder_kwargs = encoder_classes or {}, encoder_kwargs or {}
+        _check_known("encoder_classes", encoder_classes, self.modalities)
+        _check_known("encoder_kwargs", encoder_kwargs, self.modalities)
+        if signed_keys is None:
+            signed_keys = [key for key in keys if "event" in key]
+        else:
+            _check_known("signed_keys", signed_keys, keys)
+        self.features_dim = features_dim
+        self.signed_keys = frozenset(signed_keys)
+        self.normalize_images = normalize_images
+        self.encoders = nn.ModuleList()
+        for name, modality in self.modalities.items():
+            default_class = ImageEncoder if modality.is_image else VectorEncoder
+            encoder_class = encoder_classes.get(name, default_class)
+            self.encoders.append(
+                encoder_class(modality.space, features_dim=features_dim, **encoder_kwargs.get(name, {}))
+            )
+
+    def forward(self, observations: PyTorchObs) -> th.Tensor:
+        if not isinstance(observations, dict):
+            observations = {"observation": observations}
+        features = []
+        for encoder, modality in zip(self.encoders, self.modalities.values(), strict=True):
+            decoded = [self._decode(key, observations[key], modality.is_image) for key in modality.keys]
+            features.append(encoder(decoded[0] if len(decoded) == 1 else th.cat(decoded, dim=1)))
+        return th.stack(features, dim=1)
+
+    def _decode(self, key: str, observation: th.Tensor, is_image: bool) -> th.Tensor:
+        if not is_image:
+            return observation.float().flatten(start_dim=1)
+        observation = observation.contiguous(memory_format=th.channels_last)  # cheaper on bytes than on floats
+        values = observation.float()
+        if not self.normalize_images:
+            return values
+        if key in self.signed_keys:
+            return F.threshold(values.sub_(128), -127.5, 0.0, inplace=True).mul_(EVENT_SCALE)  # 0 is "no data"
+        return values.mul_(1 / 255)
+
+
+def _make_modality(name: str, keys: Sequence[str], space: spaces.Dict, normalize_images: bool) -> Modality:
+    """The modality ``name`` made of ``keys``; ValueError if they cannot be encoded together."""
+    if isinstance(keys, str) or not keys:
+        raise ValueError(f"modality {name!r}: expected a non-empty list of observation keys, got {keys!r}.")
+    _check_known(f"modality {name!r}", keys, space.spaces)
+    boxes = [_check_box(key, space[key], normalize_images) for key in keys]
+    is_image = [len(box.shape) == 3 for box in boxes]
+    if len(keys) == 1:
+        return Modality(tuple(keys), boxes[0], is_image[0])
+    shapes = {key: box.shape for key, box in zip(keys, boxes, strict=True)}
+    if all(is_image) and len({shape[1:] for shape in shapes.values()}) == 1:
+        shape = (sum(box.shape[0] for box in boxes), *boxes[0].shape[1:])
+        dtypes = {box.dtype for box in boxes}
+        if dtypes == {np.dtype(np.uint8)}:
+            return Modality(tuple(keys), spaces.Box(0, 255, shape, np.uint8), True)
+        return Modality(tuple(keys), spaces.Box(-np.inf, np.inf, shape, np.float32), True)
+    if not any(is_image):
+        size = sum(int(np.prod(box.shape)) for box in boxes)
+        return Modality(tuple(keys), spaces.Box(-np.inf, np.inf, (size,), np.float32), False)
+    raise ValueError(
+        f"modality {name!r}: its keys must be images of one height and width, or all vectors, got {shapes}; "
+        "make them modalities of their own."
+    )
+
+
+def _check_box(key: str, space: spaces.Space[Any], normalize_images: bool) -> spaces.Box:
+    where = f"observation key {key!r}"
+    if not isinstance(space, spaces.Box):
+        raise ValueError(
+            f"{where}: expected a Box (an image or a vector), got {space}; encode it as numbers, e.g. "
+            "by a wrapper that flattens or one-hot encodes this key (gymnasium.spaces.utils.flatten)."
+        )
+    if len(space.shape) != 3:
+        return space
+    if normalize_images and not is_image_space(space):
+        raise ValueError(
+            f"{where}: expected a uint8 image with bounds 0..255, got {space.dtype} of shape {space.shape} in "
+            f"[{space.low.min()}, {space.high.max()}]; convert it to uint8, or pass "
+            "`policy_kwargs=dict(normalize_images=False)` to feed channel-first images as they are."
+        )
+    if not is_image_space_channels_first(space):
+        raise ValueError(
+            f"{where}: expected a channel-first image (C, H, W), got shape {space.shape}; SB3 transposes uint8 images "
+            "with bounds 0..255 by itself, others have to be transposed by the environment."
+        )
+    return space
+
+
+def _check_known(
+    where: str, names: Sequence[str] | Mapping[str, Any], known: Sequence[str] | Mapping[str, Any]
+) -> None:
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise ValueError(f"{where}: unknown {', '.join(map(repr, unknown))}; known are {', '.join(map(repr, known))}.")

@@ -1,0 +1,22 @@
+"""Hierarchical Adaptive Value Estimation: the algorithm, its policy and its critic."""
+
+from sb3_have.have.auxiliary import AuxiliaryLoss, AuxiliaryLossCallback
+from sb3_have.have.critic import AssignmentNetwork, GlobalCritic, LocalCritics, MultiModalCritic, RefusionNetwork
+from sb3_have.have.deepmdp import DeepMDP, DeepMDPCallback
+from sb3_have.have.have import HAVESAC
+from sb3_have.have.policies import MultiInputPolicy, MultiModalPolicy
+
+__all__ = [
+    "HAVESAC",
+    "AssignmentNetwork",
+    "AuxiliaryLoss",
+    "AuxiliaryLossCallback",
+    "DeepMDP",
+    "DeepMDPCallback",
+    "GlobalCritic",
+    "LocalCritics",
+    "MultiInputPolicy",
+    "MultiModalCritic",
+    "MultiModalPolicy",
+    "RefusionNetwork",
+]

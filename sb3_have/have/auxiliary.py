@@ -1,0 +1,98 @@
+"""Auxiliary losses on the critic's features: the interface, and the callback that switches and schedules them."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
+
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from torch import nn
+
+if TYPE_CHECKING:
+    from sb3_have.have.have import HAVESAC
+
+
+class LatentTransitions(NamedTuple):
+    """A batch of transitions as an auxiliary loss sees it (B batch, d modalities, F features, A action dimensions)."""
+
+    features: th.Tensor
+    """(B, d, F), with gradient: an auxiliary loss trains the encoder through these."""
+    actions: th.Tensor
+    """(B, A), in [-1, 1]."""
+    rewards: th.Tensor
+    """(B, 1)."""
+    next_features: th.Tensor
+    """(B, d, F), by the target encoder, without gradient."""
+    dones: th.Tensor
+    """(B, 1), 1 where the episode ended by termination."""
+
+
+class AuxiliaryLoss(nn.Module, ABC):
+    """
+    Heads and losses that help the critic's encoder to learn (as in Eq. 12).
+
+    Subclass it, name the loss ``terms``, and pass ``auxiliary={"my_loss": MyLoss}`` to HAVESAC: the heads then live in
+    the policy (so in its state_dict and zip), the critic's optimizer trains them together with the encoder, and each
+    term is logged as ``train/aux_<term>_loss``.
+
+    :param n_modalities: d
+    :param features_dim: F
+    :param action_dim: A
+    """
+
+    terms: ClassVar[tuple[str, ...]]
+
+    def __init__(self, n_modalities: int, features_dim: int, action_dim: int):
+        super().__init__()
+        self.n_modalities, self.features_dim, self.action_dim = n_modalities, features_dim, action_dim
+
+    @abstractmethod
+    def forward(self, batch: LatentTransitions) -> dict[str, th.Tensor]:
+        """One scalar loss per term, unweighted."""
+
+
+class AuxiliaryLossCallback(BaseCallback):
+    """
+    Sets the coefficients of auxiliary losses, when training starts and at every step.
+
+    The heads are part of the policy; this is the handle by which their losses are switched on and off. A coefficient
+    of 0 skips nothing but the gradient: the loss is still computed and logged.
+
+    :param coefficients: coefficient of each term
+    :param schedule: factor on all of them as a function of the progress remaining (1 at the start, 0 at the end), as
+        SB3's schedules
+    :param verbose: as in SB3
+    """
+
+    model: "HAVESAC"
+
+    def __init__(
+        self,
+        coefficients: Mapping[str, float],
+        schedule: Callable[[float], float] | None = None,
+        verbose: int = 0,
+    ):
+        super().__init__(verbose)
+        self.coefficients = dict(coefficients)
+        self.schedule = schedule
+
+    def _on_training_start(self) -> None:
+        known = [term for loss in getattr(self.model.policy, "auxiliary", {}).values() for term in loss.terms]
+        unknown = [term for term in self.coefficients if term not in known]
+        if unknown:
+            raise ValueError(
+                f"{type(self).__name__}: the model has no auxiliary loss {', '.join(map(repr, unknown))}, it has "
+                f"{', '.join(map(repr, known)) or 'none'}; build it with "
+                "HAVESAC(..., auxiliary='deepmdp') or auxiliary={<name>: <AuxiliaryLoss class>}."
+            )
+        self._set_coefficients()
+
+    def _on_step(self) -> bool:
+        if self.schedule is not None:
+            self._set_coefficients()
+        return True
+
+    def _set_coefficients(self) -> None:
+        factor = 1.0 if self.schedule is None else self.schedule(self.model._current_progress_remaining)
+        for term, coefficient in self.coefficients.items():
+            self.model.auxiliary_coefs[term] = factor * coefficient

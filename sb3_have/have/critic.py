@@ -1,0 +1,256 @@
+"""
+The value side of HAVE: local critics per modality weighted by attention (LVE), a global critic on the fused features
+(GVE), and a hypernetwork that mixes the two by state (re-fusion).
+
+Shapes: B batch, K critics (twins), d modalities, F features of a modality, A action dimensions.
+Features z are (B, d, F); the global features z_g are their concatenation (B, d*F).
+"""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import torch as th
+import torch.nn.functional as F
+from gymnasium import spaces
+from stable_baselines3.common.policies import BaseModel
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.type_aliases import PyTorchObs
+from torch import nn
+
+from sb3_have.common.encoders import MultiModalEncoder
+from sb3_have.common.networks import ParallelMLP
+
+VALUE_ESTIMATIONS = ("have", "lve", "gve")
+REFUSIONS = ("convex", "monotone", "free")
+
+
+class Values(NamedTuple):
+    """Everything that the critic says of a batch; None where ``value_estimation`` leaves a part out."""
+
+    q: th.Tensor
+    """(K, B): the value that acts, H(q_g, q_l) for "have"."""
+    q_global: th.Tensor | None
+    """(K, B): q_g."""
+    q_local: th.Tensor | None
+    """(K, d, B): q_i."""
+    q_lve: th.Tensor | None
+    """(K, B): q_l, the weighted sum of the local values (Eq. 6)."""
+    weights: th.Tensor | None
+    """(B, d): w."""
+
+
+class LocalCritics(nn.Module):
+    """
+    One critic per modality and twin, Q_i^k(z_i, a): features (B, d, F) and actions (B, A) to values (K, d, B).
+
+    :param n_modalities: d
+    :param features_dim: F
+    :param action_dim: A
+    :param net_arch: widths of the hidden layers
+    :param activation_fn: activation between the layers
+    :param n_critics: K
+    """
+
+    def __init__(
+        self,
+        n_modalities: int,
+        features_dim: int,
+        action_dim: int,
+        net_arch: Sequence[int],
+        activation_fn: type[nn.Module] = nn.ReLU,
+        n_critics: int = 2,
+    ):
+        super().__init__()
+        self.shape = (n_critics, n_modalities)
+        self.net = ParallelMLP(n_critics * n_modalities, features_dim + action_dim, 1, net_arch, activation_fn)
+
+    def forward(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        n_critics, n_modalities = self.shape
+        inputs = th.cat([features, actions.unsqueeze(1).expand(-1, n_modalities, -1)], dim=2)
+        inputs = inputs.transpose(0, 1).repeat(n_critics, 1, 1)  # (K * d, B, F + A)
+        return self.net(inputs).view(n_critics, n_modalities, -1)  # type: ignore[no-any-return]
+
+
+class GlobalCritic(nn.Module):
+    """
+    Twin critics on the concatenated features, Q_g^k(z_g, a): (B, d, F) and (B, A) to (K, B).
+
+    :param n_modalities: d
+    :param features_dim: F
+    :param action_dim: A
+    :param net_arch: widths of the hidden layers
+    :param activation_fn: activation between the layers
+    :param n_critics: K
+    """
+
+    def __init__(
+        self,
+        n_modalities: int,
+        features_dim: int,
+        action_dim: int,
+        net_arch: Sequence[int],
+        activation_fn: type[nn.Module] = nn.ReLU,
+        n_critics: int = 2,
+    ):
+        super().__init__()
+        self.n_critics = n_critics
+        self.net = ParallelMLP(n_critics, n_modalities * features_dim + action_dim, 1, net_arch, activation_fn)
+
+    def forward(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        inputs = th.cat([features.flatten(start_dim=1), actions], dim=1).expand(self.n_critics, -1, -1)
+        return self.net(inputs).squeeze(2)  # type: ignore[no-any-return]
+
+
+class AssignmentNetwork(nn.Module):
+    """
+    Attention of the fused features over the modalities: (B, d, F) to weights (B, d), positive, summing to 1.
+
+    Eq. 9: w = softmax_i((W_q z_g) . (W_k z_i) / sqrt(p)).
+
+    :param n_modalities: d
+    :param features_dim: F
+    :param attention_dim: p
+    """
+
+    def __init__(self, n_modalities: int, features_dim: int, attention_dim: int = 32):
+        super().__init__()
+        self.query = nn.Linear(n_modalities * features_dim, attention_dim, bias=False)
+        self.key = nn.Linear(features_dim, attention_dim, bias=False)
+
+    def forward(self, features: th.Tensor) -> th.Tensor:
+        query = self.query(features.flatten(start_dim=1)).unsqueeze(2)  # (B, p, 1)
+        scores = (self.key(features) @ query).squeeze(2)
+        return F.softmax(scores / math.sqrt(query.shape[1]), dim=1)
+
+
+class RefusionNetwork(nn.Module):
+    """
+    H(q_g, q_l; z_g) with weights from hypernetworks of the fused features (section 3.4): (K, B), (K, B), (B, d, F) to
+    (K, B).
+
+    - "convex": H = b_g q_g + b_l q_l, (b_g, b_l) = softmax of a linear layer of z_g, without state bias. The
+      gradients in q_g and q_l are positive (Remark 1), and mixing both sides of the Bellman equation (Eq. 10)
+      changes nothing.
+    - "monotone": a two-layer perceptron on (q_g, q_l), its weights and biases given by one linear layer each, the
+      weights made positive by softplus: the gradients are positive too. The hidden units are leaky ReLUs and not
+      ELUs, which go flat where values are far below zero.
+    - "free": the same without the constraint, as in the paper.
+
+    :param n_modalities: d
+    :param features_dim: F
+    :param refusion: "convex", "monotone" or "free"
+    :param hidden_dim: hidden units of "monotone" and "free"
+    """
+
+    def __init__(self, n_modalities: int, features_dim: int, refusion: str = "convex", hidden_dim: int = 8):
+        super().__init__()
+        self.refusion = refusion
+        self.hidden_dim = hidden_dim
+        n_inputs = n_modalities * features_dim
+        if refusion == "convex":
+            self.gate = nn.Linear(n_inputs, 2)
+            nn.init.normal_(self.gate.weight, std=1e-2)  # begin with about one half each
+            nn.init.zeros_(self.gate.bias)
+        else:
+            self.hyper_w1 = nn.Linear(n_inputs, 2 * hidden_dim)
+            self.hyper_b1 = nn.Linear(n_inputs, hidden_dim)
+            self.hyper_w2 = nn.Linear(n_inputs, hidden_dim)
+            self.hyper_b2 = nn.Linear(n_inputs, 1)
+
+    def forward(self, q_global: th.Tensor, q_lve: th.Tensor, features: th.Tensor) -> th.Tensor:
+        z = features.flatten(start_dim=1)
+        q = th.stack([q_global, q_lve], dim=2)  # (K, B, 2)
+        if self.refusion == "convex":
+            gate = F.softmax(self.gate(z), dim=1)
+            return (q * gate).sum(dim=2)
+        w1 = self.hyper_w1(z).view(-1, 2, self.hidden_dim)
+        w2 = self.hyper_w2(z)
+        if self.refusion == "monotone":
+            w1, w2 = F.softplus(w1), F.softplus(w2) / self.hidden_dim
+        hidden = th.einsum("kbq,bqh->kbh", q, w1) + self.hyper_b1(z)
+        b2: th.Tensor = self.hyper_b2(z).squeeze(1)
+        return (F.leaky_relu(hidden, 0.1) * w2).sum(dim=2) + b2
+
+
+class MultiModalCritic(BaseModel):
+    """
+    Encoder and values of HAVE: ``critic(obs, actions)`` gives K values of shape (B, 1), as SB3's critics do.
+
+    :param observation_space: the policy's observation space
+    :param action_space: Box
+    :param encoder: from raw observations to features (B, d, F); the critic owns it
+    :param net_arch: widths of the hidden layers of every local and global critic
+    :param activation_fn: activation between the layers
+    :param n_critics: K
+    :param value_estimation: "have" H(q_g, q_l), "lve" q_l alone, "gve" q_g alone; only what is used is built
+    :param refusion: form of H, see :class:`RefusionNetwork`
+    :param attention_dim: p of Eq. 9
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Box,
+        encoder: MultiModalEncoder,
+        net_arch: Sequence[int],
+        activation_fn: type[nn.Module] = nn.ReLU,
+        n_critics: int = 2,
+        value_estimation: str = "have",
+        refusion: str = "convex",
+        attention_dim: int = 32,
+    ):
+        super().__init__(observation_space, action_space, normalize_images=encoder.normalize_images)
+        if value_estimation not in VALUE_ESTIMATIONS:
+            raise ValueError(f"value_estimation={value_estimation!r}: expected one of {VALUE_ESTIMATIONS}.")
+        if refusion not in REFUSIONS:
+            raise ValueError(f"refusion={refusion!r}: expected one of {REFUSIONS}.")
+        self.value_estimation = value_estimation
+        self.encoder = encoder
+        n_modalities, features_dim = len(encoder.modalities), encoder.features_dim
+        heads = (n_modalities, features_dim, get_action_dim(action_space), net_arch, activation_fn, n_critics)
+        if value_estimation != "gve":
+            self.local_critics = LocalCritics(*heads)
+            self.assignment = AssignmentNetwork(n_modalities, features_dim, attention_dim)
+        if value_estimation != "lve":
+            self.global_critic = GlobalCritic(*heads)
+        if value_estimation == "have":
+            self.refusion = RefusionNetwork(n_modalities, features_dim, refusion)
+
+    def values(self, features: th.Tensor, actions: th.Tensor) -> Values:
+        """All values at features (B, d, F) and actions (B, A), weights computed once and shared by the twins."""
+        q_global = q_local = q_lve = weights = None
+        if self.value_estimation != "gve":
+            q_local = self.local_critics(features, actions)
+            weights = self.assignment(features)
+            q_lve = (q_local * weights.t()).sum(dim=1)  # Eq. 6
+        if self.value_estimation != "lve":
+            q_global = self.global_critic(features, actions)
+        if q_lve is None:
+            q = q_global
+        elif q_global is None:
+            q = q_lve
+        else:
+            q = self.refusion(q_global, q_lve, features)  # section 3.4
+        assert q is not None
+        return Values(q, q_global, q_local, q_lve, weights)
+
+    def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
+        return tuple(self.values(self.encoder(obs), actions).q.unsqueeze(2))
+
+    def weights(self, features: th.Tensor) -> th.Tensor:
+        """Weights of the modalities (B, d) at features (B, d, F)."""
+        if self.value_estimation == "gve":
+            raise ValueError('value_estimation="gve" has no weights of modalities: train with "have" or "lve".')
+        return self.assignment(features)  # type: ignore[no-any-return]
+
+    def decompose(self, obs: PyTorchObs, actions: th.Tensor) -> dict[str, th.Tensor]:
+        """
+        The parts of the value, for study: ``q`` (K, B) and, where they exist, ``q_global`` (K, B), ``q_local``
+        (K, d, B), ``q_lve`` (K, B), ``weights`` (B, d).
+
+        :param obs: raw observations, as the critic takes them
+        :param actions: (B, A), scaled to [-1, 1]
+        """
+        values = self.values(self.encoder(obs), actions)
+        return {name: value for name, value in values._asdict().items() if value is not None}

@@ -1,0 +1,372 @@
+"""HAVESAC: soft actor-critic with Hierarchical Adaptive Value Estimation."""
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3 import SAC
+from stable_baselines3.common.base_class import maybe_make_env
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import polyak_update
+
+from sb3_have.have.auxiliary import AuxiliaryLoss, LatentTransitions
+from sb3_have.have.critic import MultiModalCritic, Values
+from sb3_have.have.policies import MultiModalPolicy, check_observation
+
+SelfHAVESAC = TypeVar("SelfHAVESAC", bound="HAVESAC")
+TARGETS = ("bellman", "paper")
+
+
+class HAVESAC(SAC):
+    """
+    Soft actor-critic with Hierarchical Adaptive Value Estimation (HAVE, NeurIPS 2023) for agents with several sensors.
+
+    Every modality of the observation has an encoder and a local critic; attention weighs the local values (LVE), a
+    global critic reads all features (GVE), and a hypernetwork mixes the two (re-fusion). Critic and auxiliary losses
+    train the encoders, in one backward pass; the actor reads their detached features. Parameters that are not listed
+    here are SAC's.
+
+    :param policy: "MultiInputPolicy" or a subclass of :class:`MultiModalPolicy`
+    :param env: environment with Box actions and Dict (or Box) observations
+    :param value_estimation: which value acts: "have" (re-fusion of both), "lve" (weighted local values alone) or "gve"
+        (global value alone), the paper's ablations
+    :param refusion: form of the re-fusion network: "convex", "monotone" or "free" (the paper's), see
+        :class:`~sb3_have.have.critic.RefusionNetwork`
+    :param target: "bellman": y = r + gamma (1 - done) (min_k H'_k - alpha log pi). "paper": Eq. 10 as it is written,
+        both sides of the Bellman equation mixed, y = min_k H'_k(y_g, y_l) with y_j = r + gamma (1 - done)
+        (q'_j - alpha log pi). With "convex" re-fusion the two are equal; with "free" the second one diverges.
+    :param local_coef: weight of the loss that also regresses q_g, q_l and every local value on the target (0 is the
+        paper)
+    :param modality_dropout: probability with which a modality's features are blanked in a training sample, for critic
+        and actor alike, never all of them
+    :param auxiliary: "deepmdp", None, or ``{name: AuxiliaryLoss class}`` ("deepmdp" included where wanted): the
+        auxiliary losses that are trained, with coefficient 1 (see :class:`~sb3_have.DeepMDPCallback`)
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MultiInputPolicy": MultiModalPolicy,
+        "MlpPolicy": MultiModalPolicy,
+        "CnnPolicy": MultiModalPolicy,
+    }
+    policy: MultiModalPolicy
+    critic: MultiModalCritic  # type: ignore[assignment]
+    critic_target: MultiModalCritic  # type: ignore[assignment]
+
+    def __init__(
+        self,
+        policy: str | type[MultiModalPolicy],
+        env: GymEnv | str | None,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 1_000_000,
+        learning_starts: int = 100,
+        batch_size: int = 256,
+        tau: float = 0.005,
+        gamma: float = 0.99,
+        train_freq: int | tuple[int, str] = 1,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[ReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        n_steps: int = 1,
+        ent_coef: str | float = "auto",
+        target_update_interval: int = 1,
+        target_entropy: str | float = "auto",
+        use_sde: bool = False,
+        sde_sample_freq: int = -1,
+        use_sde_at_warmup: bool = False,
+        value_estimation: str = "have",
+        refusion: str = "convex",
+        target: str = "bellman",
+        local_coef: float = 1.0,
+        modality_dropout: float = 0.0,
+        auxiliary: str | Mapping[str, type[AuxiliaryLoss]] | None = "deepmdp",
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        policy_kwargs: dict[str, Any] | None = None,
+        verbose: int = 0,
+        seed: int | None = None,
+        device: th.device | str = "auto",
+        _init_setup_model: bool = True,
+    ):
+        if target not in TARGETS:
+            raise ValueError(f"target={target!r}: expected one of {TARGETS}.")
+        if local_coef < 0:
+            raise ValueError(f"local_coef={local_coef}: expected a number >= 0.")
+        if not 0 <= modality_dropout < 1:
+            raise ValueError(f"modality_dropout={modality_dropout}: expected a probability in [0, 1).")
+        losses = _auxiliary_classes(auxiliary)
+        policy_kwargs = {"value_estimation": value_estimation, "refusion": refusion, **(policy_kwargs or {})}
+        own_losses = {
+            name: loss for name, loss in losses.items() if name not in MultiModalPolicy.default_auxiliary_losses
+        }
+        if own_losses:
+            policy_kwargs["auxiliary_losses"] = own_losses
+        if env is not None:
+            env = maybe_make_env(env, verbose)
+            if not isinstance(env.action_space, spaces.Box):
+                raise ValueError(
+                    f"action space: HAVESAC needs continuous actions (Box), got {env.action_space}; use a wrapper that "
+                    "maps a Box to these actions, or an algorithm for discrete actions such as SB3's DQN."
+                )
+        super().__init__(
+            policy,
+            env,  # type: ignore[arg-type]
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise,
+            replay_buffer_class=replay_buffer_class,
+            replay_buffer_kwargs=replay_buffer_kwargs,
+            optimize_memory_usage=optimize_memory_usage,
+            n_steps=n_steps,
+            ent_coef=ent_coef,
+            target_update_interval=target_update_interval,
+            target_entropy=target_entropy,
+            use_sde=use_sde,
+            sde_sample_freq=sde_sample_freq,
+            use_sde_at_warmup=use_sde_at_warmup,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            policy_kwargs=policy_kwargs,
+            verbose=verbose,
+            seed=seed,
+            device=device,
+            _init_setup_model=False,
+        )
+        self.target = target
+        self.local_coef = local_coef
+        self.modality_dropout = modality_dropout
+        self.auxiliary_coefs = {term: 1.0 for loss in losses.values() for term in loss.terms}
+        if _init_setup_model:
+            self._setup_model()
+
+    def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        self.policy.set_training_mode(True)
+        optimizers = [self.actor.optimizer, self.critic.optimizer]
+        if self.ent_coef_optimizer is not None:
+            optimizers += [self.ent_coef_optimizer]
+        self._update_learning_rate(optimizers)
+        actor_parameters = list(self.actor.parameters())
+        critic_parameters: list[th.Tensor] = list(self.critic.parameters())
+        target_parameters: list[th.Tensor] = list(self.critic_target.parameters())
+        assert isinstance(self.target_entropy, float)  # for the type checker
+        logs: dict[str, list[th.Tensor]] = {}
+
+        for _ in range(gradient_steps):
+            self._n_updates += 1
+            replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
+            discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
+
+            # Each observation is encoded once; the target encoder's features also feed the next action and DeepMDP
+            features = self.policy.encode(replay_data.observations)
+            with th.no_grad():
+                next_features = self.critic_target.encoder(replay_data.next_observations)
+            inputs = self._drop_modalities(features)
+            actor_inputs = inputs.detach()
+
+            # Entropy temperature (see SB3's SAC)
+            if self.use_sde:
+                self.actor.reset_noise()
+            actions_pi, log_prob = self.actor.action_log_prob(actor_inputs.flatten(start_dim=1))
+            if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
+                ent_coef = th.exp(self.log_ent_coef.detach())
+                ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
+                self.ent_coef_optimizer.zero_grad()
+                ent_coef_loss.backward()  # type: ignore[no-untyped-call]
+                self.ent_coef_optimizer.step()
+                logs.setdefault("ent_coef_loss", []).append(ent_coef_loss.detach())
+            else:
+                ent_coef = self.ent_coef_tensor
+            logs.setdefault("ent_coef", []).append(ent_coef)
+
+            # Critics, and the auxiliary losses on the same features: one backward pass, one optimizer
+            with th.no_grad():
+                next_actions, next_log_prob = self.actor.action_log_prob(next_features.flatten(start_dim=1))
+                entropy_bonus = -ent_coef * next_log_prob
+                rewards, not_done = replay_data.rewards.squeeze(1), 1 - replay_data.dones.squeeze(1)
+                discounts = discounts * not_done if isinstance(discounts, float) else discounts.squeeze(1) * not_done
+                target_q = self._target_values(next_features, next_actions, rewards, discounts, entropy_bonus)
+            values = self.critic.values(inputs, replay_data.actions)
+            critic_loss = self._critic_loss(values, target_q)
+            logs.setdefault("critic_loss", []).append(critic_loss.detach())
+            batch = LatentTransitions(
+                features, replay_data.actions, replay_data.rewards, next_features, replay_data.dones
+            )
+            loss = critic_loss
+            for term, aux_loss in self._auxiliary_losses(batch).items():
+                loss = loss + self.auxiliary_coefs[term] * aux_loss
+                logs.setdefault(f"aux_{term}_loss", []).append(aux_loss.detach())
+            self.critic.optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            self.critic.optimizer.step()
+
+            # Actor (Eq. 11): minimum over the twins after mixing, gradients for the actor's parameters alone
+            min_q_pi = self.critic.values(actor_inputs, actions_pi).q.min(dim=0).values
+            actor_loss = (ent_coef * log_prob - min_q_pi).mean()
+            logs.setdefault("actor_loss", []).append(actor_loss.detach())
+            gradients = th.autograd.grad(actor_loss, actor_parameters)
+            for parameter, gradient in zip(actor_parameters, gradients, strict=True):
+                parameter.grad = gradient
+            self.actor.optimizer.step()
+
+            # Target networks: encoder, every critic, assignment and re-fusion
+            if self._n_updates % self.target_update_interval == 0:
+                with th.no_grad():
+                    th._foreach_lerp_(target_parameters, critic_parameters, self.tau)
+                polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
+
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, tensors in logs.items():
+            self.logger.record(f"train/{name}", th.stack(tensors).mean().item())
+
+    def _target_values(
+        self,
+        next_features: th.Tensor,
+        next_actions: th.Tensor,
+        rewards: th.Tensor,
+        discounts: th.Tensor,
+        entropy_bonus: th.Tensor,
+    ) -> th.Tensor:
+        """
+        The regression target y (B,).
+
+        :param next_features: (B, d, F) by the target encoder
+        :param next_actions: (B, A) by the actor
+        :param rewards: (B,)
+        :param discounts: (B,) gamma, 0 where the episode ended
+        :param entropy_bonus: (B,) -alpha log pi(a'|z')
+        """
+        values = self.critic_target.values(next_features, next_actions)
+        if self.target == "paper" and values.q_global is not None and values.q_lve is not None:
+            target_global = rewards + discounts * (values.q_global + entropy_bonus)
+            target_lve = rewards + discounts * (values.q_lve + entropy_bonus)
+            mixed: th.Tensor = self.critic_target.refusion(target_global, target_lve, next_features)
+            return mixed.min(dim=0).values  # Eq. 10
+        return rewards + discounts * (values.q.min(dim=0).values + entropy_bonus)
+
+    def _critic_loss(self, values: Values, target_q: th.Tensor) -> th.Tensor:
+        """
+        Squared error of the value that acts and, times ``local_coef``, of its parts: q_g, q_l, and the mean over the
+        modalities of q_i. Halved and summed over the twins, as SB3 does.
+
+        :param values: the critic's values at the sampled actions
+        :param target_q: (B,)
+        """
+
+        def squared_error(q: th.Tensor) -> th.Tensor:
+            return 0.5 * (q - target_q).square().mean(dim=tuple(range(1, q.dim()))).sum()
+
+        loss = squared_error(values.q)
+        if self.local_coef > 0:
+            parts = [values.q_local]
+            if self.critic.value_estimation == "have":
+                parts += [values.q_global, values.q_lve]
+            loss = loss + self.local_coef * sum(squared_error(part) for part in parts if part is not None)
+        return loss
+
+    def _auxiliary_losses(self, batch: LatentTransitions) -> dict[str, th.Tensor]:
+        """The terms that are switched on, of every auxiliary loss that has one."""
+        terms: dict[str, th.Tensor] = {}
+        for loss in self.policy.auxiliary.values():
+            if any(term in self.auxiliary_coefs for term in loss.terms):  # type: ignore[union-attr]
+                terms.update(loss(batch))
+        return {term: value for term, value in terms.items() if term in self.auxiliary_coefs}
+
+    def _drop_modalities(self, features: th.Tensor) -> th.Tensor:
+        """Blanks each modality of each sample with probability ``modality_dropout``, but never all of a sample."""
+        if self.modality_dropout == 0:
+            return features
+        batch_size, n_modalities, _ = features.shape
+        kept = th.rand(batch_size, n_modalities, device=features.device) >= self.modality_dropout
+        spared = th.randint(n_modalities, (batch_size, 1), device=features.device)
+        kept |= ~kept.any(dim=1, keepdim=True) & th.zeros_like(kept).scatter_(1, spared, True)
+        return features * kept.unsqueeze(2)
+
+    def modality_weights(self, observation: np.ndarray | dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """
+        The attention weights of the modalities (Eq. 9), which sum to 1.
+
+        :param observation: one observation or a batch, as for ``predict``
+        :return: an array (B,) for each modality
+        :raises ValueError: with ``value_estimation="gve"``, which has no weights
+        """
+        self.policy.set_training_mode(False)
+        obs, _ = self.policy.obs_to_tensor(observation)
+        with th.no_grad():
+            weights = self.critic.weights(self.policy.encode(obs)).cpu().numpy()
+        return dict(zip(self.critic.encoder.modalities, weights.T, strict=True))
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        assert self._last_obs is not None
+        check_observation(self._last_obs, self.observation_space)
+        return result
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Refuses NaN before it reaches the replay buffer, where it would spoil the networks unseen."""
+        check_observation(new_obs, self.observation_space)
+        if not np.isfinite(reward).all():
+            raise ValueError(
+                f"reward: got {reward} at step {self.num_timesteps}, expected finite numbers; mend the environment's "
+                "reward function (SB3's VecCheckNan shows where it comes from)."
+            )
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def learn(
+        self: SelfHAVESAC,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str = "HAVESAC",
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfHAVESAC:
+        return super().learn(
+            total_timesteps=total_timesteps,
+            callback=callback,
+            log_interval=log_interval,
+            tb_log_name=tb_log_name,
+            reset_num_timesteps=reset_num_timesteps,
+            progress_bar=progress_bar,
+        )
+
+
+def _auxiliary_classes(auxiliary: str | Mapping[str, type[AuxiliaryLoss]] | None) -> dict[str, type[AuxiliaryLoss]]:
+    """The losses that are switched on, by name."""
+    known = MultiModalPolicy.default_auxiliary_losses
+    if auxiliary is None:
+        return {}
+    if isinstance(auxiliary, str):
+        if auxiliary not in known:
+            raise ValueError(
+                f"auxiliary={auxiliary!r}: expected one of {list(known)}, None, or {{name: AuxiliaryLoss class}}."
+            )
+        return {auxiliary: known[auxiliary]}
+    return dict(auxiliary)

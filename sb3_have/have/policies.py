@@ -1,0 +1,193 @@
+"""MultiModalPolicy: encoder, actor, MultiModalCritic, its target, and the heads of the auxiliary losses."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, get_actor_critic_arch
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+from stable_baselines3.sac.policies import Actor, SACPolicy
+from torch import nn
+
+from sb3_have.common.encoders import MultiModalEncoder
+from sb3_have.have.auxiliary import AuxiliaryLoss
+from sb3_have.have.critic import MultiModalCritic
+from sb3_have.have.deepmdp import DeepMDP
+
+
+class MultiModalPolicy(SACPolicy):
+    """
+    Policy of HAVESAC for Dict observations (images and vectors mixed) or a single Box.
+
+    The critic owns the encoder: critic and auxiliary losses train it. The actor, SB3's own, reads the detached
+    features, so ``policy.actor`` takes features (B, d*F) and ``policy(obs)`` or ``policy.predict(obs)`` observations.
+    SB3's ``share_features_extractor=True`` does the reverse, it trains the encoder by the actor's loss.
+
+    :param observation_space: Dict of Boxes, or a Box
+    :param action_space: Box
+    :param lr_schedule: learning rate as a function of the progress remaining
+    :param net_arch: hidden layers of actor and critics, as in SB3: a list, or ``dict(pi=[...], qf=[...])``
+    :param activation_fn: activation of actor and critics
+    :param use_sde: whether to explore by gSDE
+    :param log_std_init: initial log standard deviation of gSDE
+    :param use_expln: gSDE: ``expln()`` instead of ``exp()``
+    :param clip_mean: gSDE: bound of the mean action
+    :param normalize_images: whether uint8 images are decoded, see :class:`~sb3_have.common.encoders.MultiModalEncoder`
+    :param optimizer_class: optimizer of actor and critic
+    :param optimizer_kwargs: its keyword arguments, without the learning rate
+    :param n_critics: number of critics (twins)
+    :param features_dim: F, features of each modality
+    :param modalities: observation keys of each modality; by default each key is one
+    :param encoder_classes: own encoder classes of some modalities
+    :param encoder_kwargs: keyword arguments of the encoders of some modalities
+    :param signed_keys: image keys of signed counts around 128; by default those with "event" in their name
+    :param value_estimation: "have", "lve" or "gve"
+    :param refusion: "convex", "monotone" or "free"
+    :param attention_dim: p of Eq. 9
+    :param auxiliary_losses: heads of auxiliary losses by name, in addition to DeepMDP's
+    """
+
+    critic: MultiModalCritic  # type: ignore[assignment]
+    critic_target: MultiModalCritic  # type: ignore[assignment]
+    default_auxiliary_losses: ClassVar[dict[str, type[AuxiliaryLoss]]] = {"deepmdp": DeepMDP}
+
+    def __init__(
+        self,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
+        activation_fn: type[nn.Module] = nn.ReLU,
+        use_sde: bool = False,
+        log_std_init: float = -3,
+        use_expln: bool = False,
+        clip_mean: float = 2.0,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+        n_critics: int = 2,
+        features_dim: int = 50,
+        modalities: Mapping[str, Sequence[str]] | None = None,
+        encoder_classes: Mapping[str, type[nn.Module]] | None = None,
+        encoder_kwargs: Mapping[str, Mapping[str, Any]] | None = None,
+        signed_keys: Sequence[str] | None = None,
+        value_estimation: str = "have",
+        refusion: str = "convex",
+        attention_dim: int = 32,
+        auxiliary_losses: Mapping[str, type[AuxiliaryLoss]] | None = None,
+    ):
+        self.encoder_kwargs: dict[str, Any] = {
+            "features_dim": features_dim,
+            "modalities": modalities,
+            "encoder_classes": encoder_classes,
+            "encoder_kwargs": encoder_kwargs,
+            "signed_keys": signed_keys,
+        }
+        self.value_kwargs: dict[str, Any] = {
+            "value_estimation": value_estimation,
+            "refusion": refusion,
+            "attention_dim": attention_dim,
+        }
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        self.critic = self.make_critic()
+        self.critic_target = self.make_critic()
+        self.critic_target.load_state_dict(self.critic.state_dict())
+        self.critic_target.requires_grad_(False)
+        self.critic_target.set_training_mode(False)
+
+        encoder = self.critic.encoder
+        sizes = (len(encoder.modalities), encoder.features_dim, get_action_dim(self.action_space))
+        losses = {**self.default_auxiliary_losses, **self.auxiliary_losses}
+        self.auxiliary = nn.ModuleDict({name: loss_class(*sizes) for name, loss_class in losses.items()})
+
+        self.actor = self.make_actor()
+        self.actor.optimizer = self._make_optimizer(list(self.actor.parameters()), lr_schedule)
+        critic_parameters = [*self.critic.parameters(), *self.auxiliary.parameters()]
+        self.critic.optimizer = self._make_optimizer(critic_parameters, lr_schedule)
+
+    def _make_optimizer(self, parameters: list[nn.Parameter], lr_schedule: Schedule) -> th.optim.Optimizer:
+        return self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+
+    def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> MultiModalCritic:  # type: ignore[override]
+        encoder = MultiModalEncoder(
+            self.observation_space,
+            normalize_images=self.normalize_images,
+            **self.encoder_kwargs,
+        )
+        return MultiModalCritic(
+            self.observation_space,
+            self.action_space,  # type: ignore[arg-type]
+            encoder,
+            net_arch=get_actor_critic_arch(self.net_arch)[1],
+            activation_fn=self.activation_fn,
+            n_critics=self.critic_kwargs["n_critics"],  # type: ignore[arg-type]
+            **self.value_kwargs,
+        ).to(self.device)
+
+    def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
+        """SB3's actor, on the space of the concatenated features z_g."""
+        features_dim = len(self.critic.encoder.modalities) * self.critic.encoder.features_dim
+        latent_space = spaces.Box(-np.inf, np.inf, (features_dim,), np.float32)
+        actor_kwargs: dict[str, Any] = {**self.actor_kwargs, "observation_space": latent_space}
+        return Actor(features_extractor=FlattenExtractor(latent_space), features_dim=features_dim, **actor_kwargs).to(
+            self.device
+        )
+
+    def encode(self, obs: PyTorchObs) -> th.Tensor:
+        """Features (B, d, F) of raw observations (as tensors, with batch dimension)."""
+        return self.critic.encoder(obs)  # type: ignore[no-any-return]
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        return self.actor(self.encode(observation).detach().flatten(start_dim=1), deterministic)  # type: ignore[no-any-return]
+
+    def obs_to_tensor(self, observation: np.ndarray | dict[str, np.ndarray]) -> tuple[PyTorchObs, bool]:
+        check_observation(observation, self.observation_space)
+        return super().obs_to_tensor(observation)
+
+    def set_training_mode(self, mode: bool) -> None:
+        super().set_training_mode(mode)  # actor and critic; the target always stays in evaluation mode
+        self.auxiliary.train(mode)
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        data = super()._get_constructor_parameters()
+        del data["features_extractor_class"], data["features_extractor_kwargs"]
+        data.update(**self.encoder_kwargs, **self.value_kwargs, auxiliary_losses=self.auxiliary_losses)
+        return data
+
+
+def check_observation(observation: np.ndarray | dict[str, np.ndarray], space: spaces.Space[Any]) -> None:
+    """
+    :param observation: one observation or a batch of them
+    :param space: the space that they belong to
+    :raises ValueError: if a key is missing or unknown, or a value is not finite; the message names the key
+    """
+    if isinstance(space, spaces.Dict):
+        if not isinstance(observation, dict):
+            raise ValueError(
+                f"Expected a dict with the keys {list(space.spaces)}, got {type(observation).__name__}; "
+                "pass the observation as the environment returns it."
+            )
+        missing = [key for key in space.spaces if key not in observation]
+        unknown = [key for key in observation if key not in space.spaces]
+        if missing or unknown:
+            raise ValueError(
+                f"observation keys {list(observation)} do not match the {list(space.spaces)} that the policy was "
+                f"built for: missing {missing}, unknown {unknown}; give every key of the training environment "
+                "(a failed sensor's image as zeros) and no other."
+            )
+    elif isinstance(observation, dict):
+        raise ValueError(f"Expected an array of shape {space.shape}, got a dict with the keys {list(observation)}.")
+    items = observation.items() if isinstance(observation, dict) else [("observation", observation)]
+    for key, value in items:
+        if np.issubdtype(np.asarray(value).dtype, np.floating) and not np.isfinite(value).all():
+            raise ValueError(
+                f"observation key {key!r}: {np.count_nonzero(~np.isfinite(value))} of {np.size(value)} values are NaN "
+                "or infinite; mend the environment (SB3's VecCheckNan shows where they come from)."
+            )
+
+
+MultiInputPolicy = MultiModalPolicy
