@@ -1,0 +1,358 @@
+"""Train by a configuration of ``zoo_configs``: a run that can be stopped and resumed at any moment.
+
+    python -m sb3_have.train --config havesac --env HighwayVision-v0 --steps 200000 --seed 0 --out runs/have-0
+
+The same command resumes. The folder holds ``monitor.csv`` (training episodes), ``evaluation.csv`` (a row per weather
+at every evaluation), ``log-<first step>/progress.csv`` (SB3's log), ``checkpoint-<step>/`` (model, replay buffer, time
+spent) and ``model.zip``. A resumed run goes on learning from the same weights, optimizers and replay buffer in a new
+episode; it does not repeat, bit for bit, what an uninterrupted one would have done.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import shutil
+import signal
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from copy import deepcopy
+from functools import partial
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import gymnasium as gym
+import pandas as pd
+import yaml
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack
+
+import sb3_have
+from sb3_have.common.evaluation import evaluate, leave_interrupts_to_parent
+from sb3_have.envs.weather import WEATHERS
+
+EVALUATION_SEED = 1_000_000
+"""Of the episodes that evaluate a run while it trains: the same for all runs."""
+
+
+def algorithms() -> dict[str, type[OffPolicyAlgorithm]]:
+    """Algorithms by the ``algo`` of a configuration."""
+    return {"havesac": sb3_have.HAVESAC, "sac": SAC}
+
+
+def config_path(name: str) -> Path:
+    """File of a configuration.
+
+    :param name: of a file, or of one in ``zoo_configs`` without its ending ("havesac")
+    :raises FileNotFoundError: if there is neither
+    """
+    package = Path(__file__).parent
+    # zoo_configs lies inside the package in a wheel and beside it in a checkout
+    candidates = [Path(name), package / "zoo_configs" / f"{name}.yml", package.parent / "zoo_configs" / f"{name}.yml"]
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise FileNotFoundError(f"no configuration {name!r}; looked for {', '.join(map(str, candidates))}")
+
+
+def load_config(name: str, env_id: str) -> dict[str, Any]:
+    """Hyper-parameters for an environment, in the format of the RL Zoo.
+
+    :param name: see :func:`config_path`
+    :param env_id: key of the block to read
+    :raises KeyError: if the file has no block for it
+    """
+    path = config_path(name)
+    blocks = yaml.safe_load(path.read_text())
+    if env_id not in blocks:
+        raise KeyError(f"{path} has no block for {env_id!r}, only for {', '.join(blocks)}")
+    return dict(blocks[env_id])
+
+
+def make_training_env(env_id: str, config: Mapping[str, Any], out: Path | None = None) -> VecEnv:
+    """The environments of a configuration, with their frame stack.
+
+    :param config: ``env_kwargs``, ``frame_stack`` and ``n_envs`` are used; several run in processes of their own
+    :param out: folder in whose ``monitor.csv`` (``<i>.monitor.csv`` for several) the episodes are appended
+    """
+
+    def make(index: int) -> gym.Env[Any, Any]:
+        leave_interrupts_to_parent()
+        env = gym.make(env_id, **config.get("env_kwargs", {}))
+        told = env.reset()[1]
+        keywords = tuple(key for key in ("distance", "weather", "end_reason") if key in told)
+        if out is None:
+            return Monitor(env, info_keywords=keywords)
+        file = out / (f"{index}.monitor.csv" if n_envs > 1 else "monitor.csv")
+        return Monitor(env, str(file), info_keywords=keywords, override_existing=not file.exists())
+
+    n_envs = config.get("n_envs", 1)
+    makers = [partial(make, index) for index in range(n_envs)]
+    vec_env: VecEnv = SubprocVecEnv(makers) if n_envs > 1 else DummyVecEnv(makers)
+    return VecFrameStack(vec_env, config["frame_stack"]) if config.get("frame_stack", 1) > 1 else vec_env
+
+
+def model_kwargs(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a configuration goes to the algorithm's constructor."""
+    for_others = {"n_timesteps", "n_envs", "frame_stack", "env_kwargs"}
+    # copied, because SB3 writes into policy_kwargs
+    return {key: deepcopy(value) for key, value in config.items() if key not in for_others}
+
+
+class RunCallback(BaseCallback):
+    """Evaluates and saves a run as it goes, and ends it in good order on Ctrl-C, SIGTERM or a time limit.
+
+    :param run: what to evaluate and where to save
+    """
+
+    def __init__(self, run: Run) -> None:
+        super().__init__()
+        self.run = run
+        self.stopping = False
+        self._in_evaluation = False
+        self._handlers: dict[int, Any] = {}
+
+    def _on_training_start(self) -> None:
+        self._started = time.monotonic()
+        self._earlier = self.run.seconds
+        self._last_step = self.num_timesteps
+        # SB3 finishes the step it is in, then stops: the buffer and the optimizers stay whole
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                self._handlers[number] = signal.signal(number, self._stop)
+
+    def _stop(self, number: int, frame: FrameType | None) -> None:
+        if self.stopping or self._in_evaluation:
+            self.stopping = True
+            raise KeyboardInterrupt
+        self.stopping = True
+
+    def _on_step(self) -> bool:
+        run, step = self.run, self.num_timesteps
+        run.seconds = self._earlier + time.monotonic() - self._started
+        if self._is_due(run.eval_freq):
+            self._in_evaluation = True
+            try:
+                run.evaluate(self.model, step)
+            except KeyboardInterrupt:
+                self.stopping = True
+            self._in_evaluation = False
+        if self._is_due(run.save_freq):
+            run.save(self.model)
+        self._last_step = step
+        out_of_time = run.time_limit is not None and time.monotonic() - self._started > run.time_limit
+        return not (self.stopping or out_of_time)
+
+    def _is_due(self, frequency: int) -> bool:
+        # a step of n environments counts n, so it may jump over a multiple
+        return frequency > 0 and self.num_timesteps // frequency > self._last_step // frequency
+
+    def restore_handlers(self) -> None:
+        """Give the signals back to whoever had them."""
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+
+
+class Run:
+    """One training run in a folder.
+
+    :param config: hyper-parameters, see :func:`load_config`
+    :param env_id: of the environment
+    :param out: folder; what it holds of an earlier run with the same settings is resumed
+    :param seed: of everything random; an earlier run in the folder must have had the same
+    :param algo: name in :func:`algorithms`
+    :param eval_freq: steps from one evaluation to the next, 0 for none
+    :param eval_episodes: episodes in each weather of an evaluation
+    :param eval_envs: processes that evaluate
+    :param weathers: to evaluate in
+    :param save_freq: steps from one checkpoint to the next, 0 for one at the end only
+    :param time_limit: of the training in this call [s], None for none
+    :param device: of the model
+    """
+
+    def __init__(
+        self,
+        config: Mapping[str, Any],
+        env_id: str,
+        out: Path,
+        seed: int = 0,
+        algo: str = "havesac",
+        eval_freq: int = 10_000,
+        eval_episodes: int = 2,
+        eval_envs: int = 1,
+        weathers: Sequence[str] = WEATHERS,
+        save_freq: int = 20_000,
+        time_limit: float | None = None,
+        device: str = "auto",
+    ) -> None:
+        self.config, self.env_id, self.out, self.seed, self.algo = dict(config), env_id, Path(out), seed, algo
+        self.eval_freq, self.eval_episodes, self.eval_envs = eval_freq, eval_episodes, eval_envs
+        self.weathers, self.save_freq, self.time_limit = weathers, save_freq, time_limit
+        self.device = device
+        self.seconds = 0.0  # spent training and evaluating, over all sessions
+        self.interrupted = False
+
+    def train(self, steps: int, progress_bar: bool = False, keep_checkpoint: bool = True) -> OffPolicyAlgorithm:
+        """Train up to a number of steps, from the newest checkpoint if there is one.
+
+        :param steps: in all, earlier sessions included
+        :param progress_bar: SB3's
+        :param keep_checkpoint: whether to write the replay buffer at the end, so that the run can go on
+        :return: the model; also saved as ``model.zip``
+        """
+        self.out.mkdir(parents=True, exist_ok=True)
+        checkpoint = newest_checkpoint(self.out)
+        done = 0 if checkpoint is None else checkpoint_step(checkpoint)
+        self._forget_after(done)
+        env = make_training_env(self.env_id, self.config, self.out)
+        algorithm = algorithms()[self.algo]
+        if checkpoint is None:
+            model = algorithm(env=env, seed=self.seed, device=self.device, **model_kwargs(self.config))
+        else:
+            model = self._load(algorithm, checkpoint, env)
+        model.set_logger(configure(str(self.out / f"log-{done}"), ["csv"]))
+        callback = RunCallback(self)
+        try:
+            if done < steps:
+                model.learn(
+                    steps - done, callback=callback, reset_num_timesteps=checkpoint is None, progress_bar=progress_bar
+                )
+        except KeyboardInterrupt:
+            callback.stopping = True
+        finally:
+            callback.restore_handlers()
+            env.close()
+        self.interrupted = callback.stopping
+        if keep_checkpoint and model.num_timesteps > done:
+            self.save(model)
+        _write_atomically(self.out / "model.zip", model.save)
+        return model
+
+    def _load(self, algorithm: type[OffPolicyAlgorithm], checkpoint: Path, env: VecEnv) -> OffPolicyAlgorithm:
+        state = json.loads((checkpoint / "state.json").read_text())
+        now = self._settings()
+        if state["settings"] != now:
+            raise ValueError(f"{checkpoint} is of a run with {state['settings']}, not {now}; choose another folder")
+        self.seconds = state["seconds"]
+        model = algorithm.load(checkpoint / "model.zip", env=env, device=self.device)
+        model.load_replay_buffer(checkpoint / "replay_buffer.pkl")
+        # other episodes and noise than those at the start of the run
+        model.set_random_seed(self.seed + model.num_timesteps)
+        return model
+
+    def _settings(self) -> dict[str, Any]:
+        config = {key: value for key, value in self.config.items() if key != "n_timesteps"}
+        settings = {"config": config, "env_id": self.env_id, "seed": self.seed, "algo": self.algo}
+        return dict(json.loads(json.dumps(settings)))
+
+    def _forget_after(self, step: int) -> None:
+        """Drop what was recorded after the checkpoint that is resumed: it will be lived through again."""
+        path = self.out / "evaluation.csv"
+        if path.exists():
+            rows = pd.read_csv(path)
+            _write_atomically(path, partial(rows[rows["step"] <= step].to_csv, index=False))
+        for path in self.out.glob("*monitor.csv"):
+            if step == 0:
+                path.unlink()
+                continue
+            head, *lines = path.read_text().splitlines(keepends=True)
+            rows = pd.read_csv(io.StringIO("".join(lines)))
+            kept = int((rows["l"].cumsum() <= step / self.config.get("n_envs", 1)).sum())
+            _write_atomically(path, partial(Path.write_text, data="".join([head, *lines[: kept + 1]])))
+
+    def save(self, model: OffPolicyAlgorithm) -> None:
+        """Write ``checkpoint-<step>``: it appears complete or not at all, and then the older one goes."""
+        older = newest_checkpoint(self.out)
+        target = self.out / f"checkpoint-{model.num_timesteps}"
+        if target == older:
+            return
+        partial = self.out / "checkpoint.partial"
+        shutil.rmtree(partial, ignore_errors=True)
+        partial.mkdir()
+        model.save(partial / "model.zip")
+        model.save_replay_buffer(partial / "replay_buffer.pkl")
+        state = {"seconds": self.seconds, "settings": self._settings()}
+        (partial / "state.json").write_text(json.dumps(state, indent=1))
+        partial.rename(target)
+        if older is not None:
+            shutil.rmtree(older)
+
+    def evaluate(self, model: Any, step: int) -> None:
+        """Append a row per weather to ``evaluation.csv`` and print their mean."""
+        env_kwargs = {key: value for key, value in self.config.get("env_kwargs", {}).items() if key != "weather"}
+        frame = evaluate(
+            model, self.env_id, self.weathers, self.eval_episodes, EVALUATION_SEED, env_kwargs, n_envs=self.eval_envs
+        )
+        frame.insert(0, "step", step)
+        frame.insert(1, "seed", self.seed)
+        frame.insert(2, "wall_time", round(self.seconds, 1))
+        path = self.out / "evaluation.csv"
+        frame.to_csv(path, mode="a", header=not path.exists() or not path.stat().st_size, index=False)
+        print(
+            f"step {step}: return {frame['return_mean'].mean():.1f}, distance {frame['distance_mean'].mean():.0f} m "
+            f"over {len(frame)} weathers, {self.seconds / 60:.1f} min",
+            flush=True,
+        )
+
+
+def checkpoint_step(checkpoint: Path) -> int:
+    """Training steps of a checkpoint."""
+    return int(checkpoint.name.rpartition("-")[2])
+
+
+def newest_checkpoint(out: Path) -> Path | None:
+    """The complete checkpoint with the most steps, if any."""
+    return max(out.glob("checkpoint-*"), key=checkpoint_step, default=None)
+
+
+def _write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
+    partial = path.with_name(f"partial-{path.name}")
+    write(partial)
+    partial.replace(path)
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Command line of ``python -m sb3_have.train``."""
+    parser = argparse.ArgumentParser(prog="python -m sb3_have.train", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--config", default="havesac", help="YAML file, or the name of one in zoo_configs")
+    parser.add_argument("--algo", default="havesac", choices=["havesac", "sac"])
+    parser.add_argument("--env", default="HighwayVision-v0", help="environment id")
+    parser.add_argument("--steps", type=int, help="in all; default: n_timesteps of the configuration")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, required=True, help="folder of the run; the same folder resumes it")
+    parser.add_argument("--eval-freq", type=int, default=10_000, help="steps between evaluations, 0 for none")
+    parser.add_argument("--eval-episodes", type=int, default=2, help="in each weather")
+    parser.add_argument("--eval-envs", type=int, default=1, help="processes that evaluate")
+    parser.add_argument("--save-freq", type=int, default=20_000, help="steps between checkpoints")
+    parser.add_argument("--time-limit", type=float, help="seconds of training in this session")
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--progress-bar", action="store_true")
+    args = parser.parse_args(arguments)
+
+    config = load_config(args.config, args.env)
+    run = Run(
+        config,
+        args.env,
+        args.out,
+        seed=args.seed,
+        algo=args.algo,
+        eval_freq=args.eval_freq,
+        eval_episodes=args.eval_episodes,
+        eval_envs=args.eval_envs,
+        save_freq=args.save_freq,
+        time_limit=args.time_limit,
+        device=args.device,
+    )
+    model = run.train(args.steps or int(config["n_timesteps"]), progress_bar=args.progress_bar)
+    print(f"{model.num_timesteps} steps, {run.seconds / 60:.1f} min, {args.out / 'model.zip'}")
+
+
+if __name__ == "__main__":
+    main()
