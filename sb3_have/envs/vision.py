@@ -10,13 +10,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from sb3_have.envs.camera import PAINTS, Camera, Objects
+from sb3_have.envs.camera import Camera, Objects
+from sb3_have.envs.scene import PAINTS, Array
 from sb3_have.envs.weather import Illumination, rain_events, take_picture, weather_by_name
 from sb3_have.sensors.depth import encode_depth
 from sb3_have.sensors.event_camera import EventCamera
 from sb3_have.sensors.representations import EVENT_ZERO, Representation, decode_events, encode_events, represent
 
-Array = NDArray[np.floating]
 Observation = dict[str, NDArray[np.uint8]]
 
 MODALITIES: Final = ("rgb", "event", "depth")
@@ -94,7 +94,7 @@ class VisionSensors:
         self.spaces: dict[str, spaces.Box] = {
             name: spaces.Box(0, 255, (image_size, image_size, channels[name]), np.uint8) for name in self.modalities
         }
-        self._sizes: Array | None = None
+        self._sizes: Array = np.empty((0, 2))
         self._view: Objects | None = None
         self._time = 0.0
 
@@ -149,22 +149,22 @@ class VisionSensors:
     @property
     def last_truth(self) -> dict[str, NDArray[Any]]:
         """
-        What the last observation was made from: ``depth`` (float32 metres, infinite in the sky) and ``vehicle``, the
-        number of the traffic vehicle (its row in the poses less one) that a pixel sees, or -1. (image_size, image_size).
+        What the last observation was made from, (image_size, image_size) each: ``depth`` (float32 metres, infinite in
+        the sky) and ``vehicle``, the traffic vehicle that a pixel sees (its row in the poses less one) or -1.
         """
         if self._view is None:
             raise RuntimeError("no observation yet: call reset() first")
         last = self._view
         far_to_near = np.argsort(-last.depth, kind="stable")
         vehicle = np.full(self.image_size**2, -1)
-        vehicle[last.pixel[far_to_near]] = last.face_vehicle[last.face[far_to_near]]
+        vehicle[last.pixel[far_to_near]] = last.vehicle[last.face[far_to_near]]
         return {
             "depth": self.camera.depth(last),
             "vehicle": vehicle.reshape(self.image_size, self.image_size),
         }
 
     def _check(self, poses: Array) -> Array:
-        if self._sizes is None:
+        if not len(self._sizes):
             raise RuntimeError("call reset() before observe()")
         poses = np.asarray(poses, dtype=np.float64)
         if poses.ndim != 3 or poses.shape[1:] != (len(self._sizes), 3):
@@ -192,13 +192,13 @@ class VisionSensors:
             frames = frames * (255 * self.weather.exposure)
         size, start = self.image_size, self._time
         times = [start + duration * (k + 1) / len(frames) for k in range(len(frames))]
-        parts = [self.event_camera.detect(frame, t, rng) for frame, t in zip(frames, times)]
+        parts = [self.event_camera.detect(frame, t, rng) for frame, t in zip(frames, times, strict=True)]
         if duration == 0:
             return np.full((size, size, self.bins), EVENT_ZERO, dtype=np.uint8)
         self._time = times[-1]
         if self.weather.rain:
             parts.append(rain_events(self.weather, start, self._time, size, size, rng))
-        pixel, time, polarity = (np.concatenate(part) for part in zip(*parts))
+        pixel, time, polarity = (np.concatenate(part) for part in zip(*parts, strict=True))
         counts = represent(pixel, time, polarity, self.bins, start, self._time, size, size, self._representation)
         return encode_events(counts)
 

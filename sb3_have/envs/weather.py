@@ -14,9 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_have.envs.camera import ALBEDO, ASPHALT, LAMP, MARKING, PAINTS, VERGE, Camera, Ground, Objects
+from sb3_have.envs.camera import Camera, Ground, Objects
+from sb3_have.envs.scene import ALBEDO, ASPHALT, LAMP, MARKING, PAINTS, VERGE, Array
 
-Array = NDArray[np.floating]
 Colour = tuple[float, float, float]
 
 #: Weights of red, green and blue in the brightness that a monochrome (event) pixel sees.
@@ -73,26 +73,26 @@ _WEATHERS: Final = {
     ),
     "CloudyNight": Weather(
         sun=(0.0, 0.0, 0.0),
-        ambient=_night(3.5e-4, 1.0),
-        zenith=_night(2.5e-4, 1.0),
-        horizon=_night(6e-4, 1.0),
+        ambient=_night(2.0e-4, 1.0),
+        zenith=_night(2.0e-4, 1.0),
+        horizon=_night(4e-4, 1.0),
         exposure=40.0,
         night=True,
     ),
     "HardRainNight": Weather(
         sun=(0.0, 0.0, 0.0),
-        ambient=_night(2.5e-4, 0.5),
-        zenith=_night(1.5e-4, 0.5),
-        horizon=_night(3e-4, 0.5),
+        ambient=_night(1.4e-4, 0.5),
+        zenith=_night(1.2e-4, 0.5),
+        horizon=_night(2e-4, 0.5),
         exposure=40.0,
         wetness=1.0,
-        extinction=0.006,
+        extinction=0.005,
         rain=1.0,
         night=True,
     ),
     "WetNight": Weather(
         sun=_night(0.8e-4),
-        ambient=_night(2e-4, 0.2),
+        ambient=_night(1.5e-4, 0.2),
         zenith=_night(1e-4, 0.2),
         horizon=_night(2.5e-4, 0.2),
         exposure=40.0,
@@ -114,17 +114,17 @@ _WEATHERS: Final = {
         horizon=(0.22, 0.23, 0.25),
         exposure=2.2,
         wetness=1.0,
-        extinction=0.010,
+        extinction=0.006,
         rain=1.0,
     ),
     "WetNoon": Weather(
         sun=(0.50, 0.48, 0.42),
         ambient=(0.22, 0.24, 0.28),
         zenith=(0.24, 0.33, 0.50),
-        horizon=(0.55, 0.56, 0.55),
+        horizon=(0.50, 0.52, 0.53),
         exposure=1.15,
         wetness=0.7,
-        extinction=0.002,
+        extinction=0.001,
     ),
 }
 #: Names of the eight weathers, as in the paper.
@@ -146,14 +146,14 @@ SUN_DIRECTION: Final = np.array((-0.45, -0.30, 0.84))
 #: The sun's rays reach a vertical face under this share of the sky.
 SKY_ON_WALLS: Final = 0.55
 #: Low beam: irradiance at 1 m, reach in metres, half-width of the beam as tan(angle).
-HEADLIGHT: Final = 0.9
+HEADLIGHT: Final = 0.08
 HEADLIGHT_COLOUR: Final[Colour] = (1.0, 0.94, 0.80)
 HEADLIGHT_REACH: Final = 13.0
 HEADLIGHT_WIDTH: Final = 0.28
 #: Radiance of a tail light.
 TAIL_LIGHT: Final[Colour] = (6e-4, 4e-5, 3e-5)
 #: False events per pixel and second in the hardest rain.
-RAIN_EVENT_RATE: Final = 4.0
+RAIN_EVENT_RATE: Final = 1.5
 
 
 @dataclass
@@ -240,7 +240,7 @@ class Illumination:
 
     def _shade(self, objects: Objects) -> Array:
         """Radiance of the object samples, (samples, channels)."""
-        facing = np.clip(objects.face_normal @ SUN_DIRECTION[:2], 0, None).astype(np.float32)
+        facing = np.clip(objects.normal @ SUN_DIRECTION[:2], 0, None).astype(np.float32)
         light = self.ambient * np.float32(SKY_ON_WALLS) + facing[:, None] * self.sun
         haze = np.exp(-np.float32(self.weather.extinction) * objects.depth)[:, None]
         received = light[objects.face]
@@ -287,7 +287,9 @@ def _streaks(size: int, weather: Weather, rng: np.random.Generator) -> NDArray[n
     length = rng.uniform(0.05, 0.15, count) * size
     end = start + np.stack((0.15 * length, length), axis=-1)
     strength = rng.uniform(0.03, 0.12, count)
-    for (x0, y0), (x1, y1), brightness in zip(start.astype(int).tolist(), end.astype(int).tolist(), strength.tolist()):
+    for (x0, y0), (x1, y1), brightness in zip(
+        start.astype(int).tolist(), end.astype(int).tolist(), strength.tolist(), strict=True
+    ):
         cv2.line(streaks, (x0, y0), (x1, y1), brightness)
     return streaks
 

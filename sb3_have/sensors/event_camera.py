@@ -42,7 +42,7 @@ class EventCamera:
         reference moves all the same (as in ESIM).
     :param leak_rate: Rate of spurious positive events per pixel, in Hz, from the drift of the reference.
     :param shot_rate: Rate of random events per pixel, in Hz, half of them positive. They leave the reference alone.
-    :param mapping: ``"log"``: log(log_eps + I); ``"lin_log"``: v2e's mapping of digital numbers 0..255, linear below 20;
+    :param mapping: ``"log"``: log(log_eps + I); ``"lin_log"``: v2e's mapping of numbers 0..255, linear below 20;
         ``"identity"``: the frame is taken as it is (it may already be a logarithm).
     :param log_eps: Added to the intensity before the logarithm; it sets how dark the sensor still sees.
     :param seed: Seed of the threshold mismatch and of the noise.

@@ -100,7 +100,8 @@ def represent(
     else:
         index = pixel * bins + np.minimum((bins * (times - t0) / (t1 - t0)).astype(np.int64), bins - 1)
         weight = np.ones(len(index)) if representation == "count" else polarity
-    return np.bincount(index, weights=weight, minlength=height * width * bins).reshape(height, width, bins)
+    summed = np.bincount(index, weights=weight, minlength=height * width * bins)
+    return summed.astype(np.float64, copy=False).reshape(height, width, bins)
 
 
 def encode_events(counts: ArrayLike) -> NDArray[np.uint8]:
@@ -110,7 +111,8 @@ def encode_events(counts: ArrayLike) -> NDArray[np.uint8]:
     :param counts: Array of any shape.
     :return: uint8 of the same shape, 1..255; 128 is "no event".
     """
-    return (EVENT_ZERO + np.clip(np.rint(np.asarray(counts)), -EVENT_LIMIT, EVENT_LIMIT)).astype(np.uint8)
+    clipped = np.clip(np.rint(np.asarray(counts, dtype=np.float64)), -EVENT_LIMIT, EVENT_LIMIT)
+    return np.asarray(EVENT_ZERO + clipped, dtype=np.uint8)
 
 
 def decode_events(codes: ArrayLike) -> NDArray[np.float32]:
