@@ -74,11 +74,13 @@ def _random_vehicle(road: Road, x: float, rng: np.random.Generator) -> IDMVehicl
 
 
 def _has_room(vehicle: IDMVehicle) -> bool:
-    """Whether the gaps in front of and behind a vehicle are what IDM wants (and never under two car lengths)."""
-    front, rear = vehicle.road.neighbour_vehicles(vehicle)
-    pairs = [(vehicle, front), (rear, vehicle)]
-    return all(
-        follower.lane_distance_to(leader) >= max(vehicle.desired_gap(follower, leader), 2 * vehicle.LENGTH)
-        for follower, leader in pairs
-        if follower is not None and leader is not None
-    )
+    """Whether all gaps in the vehicle's lane are what IDM wants (and never under two car lengths).
+
+    Who is changing into the lane counts as being there: MOBIL does not look again after it has decided.
+    """
+    for other in vehicle.road.vehicles:
+        if vehicle.lane_index in (other.lane_index, getattr(other, "target_lane_index", None)):
+            pair = (vehicle, other) if vehicle.position[0] < other.position[0] else (other, vehicle)
+            if pair[0].lane_distance_to(pair[1]) < max(vehicle.desired_gap(*pair), 2 * vehicle.LENGTH):
+                return False
+    return True

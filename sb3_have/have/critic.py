@@ -169,8 +169,8 @@ class RefusionNetwork(nn.Module):
         if self.refusion == "monotone":
             w1, w2 = F.softplus(w1), F.softplus(w2) / self.hidden_dim
         hidden = th.einsum("kbq,bqh->kbh", q, w1) + self.hyper_b1(z)
-        b2: th.Tensor = self.hyper_b2(z).squeeze(1)
-        return (F.leaky_relu(hidden, 0.1) * w2).sum(dim=2) + b2
+        mixed: th.Tensor = (F.leaky_relu(hidden, 0.1) * w2).sum(dim=2) + self.hyper_b2(z).squeeze(1)
+        return mixed
 
 
 class MultiModalCritic(BaseModel):

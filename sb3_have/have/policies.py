@@ -91,6 +91,22 @@ class MultiModalPolicy(SACPolicy):
             "refusion": refusion,
             "attention_dim": attention_dim,
         }
+        self.auxiliary_losses: dict[str, type[AuxiliaryLoss]] = dict(auxiliary_losses or {})
+        super().__init__(
+            observation_space,
+            action_space,
+            lr_schedule,
+            net_arch,
+            activation_fn,
+            use_sde,
+            log_std_init,
+            use_expln,
+            clip_mean,
+            normalize_images=normalize_images,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs=optimizer_kwargs,
+            n_critics=n_critics,
+        )
 
     def _build(self, lr_schedule: Schedule) -> None:
         self.critic = self.make_critic()
