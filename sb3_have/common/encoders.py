@@ -1,6 +1,7 @@
 """From a Dict of raw observations to one feature vector per modality."""
 
 from collections.abc import Mapping, Sequence
+from functools import cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
@@ -13,6 +14,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 EVENT_SCALE = 1 / 8  # one event is 0.125, about the contrast of a clearly visible edge in an image scaled to [0, 1]
+PRECISIONS = ("auto", "float32", "bfloat16")
 PAPER_ENCODER_MIN_SIZE = 112  # px; from here on an image gets the paper's encoder, below a Nature-style one
 
 
@@ -114,6 +116,8 @@ class MultiModalEncoder(nn.Module):
     :param encoder_kwargs: keyword arguments for the encoder of some modalities
     :param signed_keys: image keys holding signed counts around 128; by default those with "event" in their name
     :param normalize_images: whether to decode images as above
+    :param precision: of the image encoders' arithmetic: "float32", "bfloat16" (features and weights stay float32), or
+        "auto", bfloat16 where the hardware multiplies it natively (CPU with AMX, CUDA from sm80 on)
     :raises ValueError: for a space, key or modality that cannot be encoded; the message names it and the remedy
     """
 
@@ -126,8 +130,11 @@ class MultiModalEncoder(nn.Module):
         encoder_kwargs: Mapping[str, Mapping[str, Any]] | None = None,
         signed_keys: Sequence[str] | None = None,
         normalize_images: bool = True,
+        precision: str = "auto",
     ):
         super().__init__()
+        if precision not in PRECISIONS:
+            raise ValueError(f"precision={precision!r}: expected one of {PRECISIONS}.")
         if not isinstance(observation_space, spaces.Dict):
             observation_space = spaces.Dict({"observation": observation_space})
         keys = list(observation_space.spaces)
@@ -148,6 +155,7 @@ class MultiModalEncoder(nn.Module):
         self.features_dim = features_dim
         self.signed_keys = frozenset(signed_keys)
         self.normalize_images = normalize_images
+        self.precision = precision
         self.encoders = nn.ModuleList()
         for name, modality in self.modalities.items():
             default_class = ImageEncoder if modality.is_image else VectorEncoder
@@ -161,20 +169,38 @@ class MultiModalEncoder(nn.Module):
             observations = {"observation": observations}
         features = []
         for encoder, modality in zip(self.encoders, self.modalities.values(), strict=True):
-            decoded = [self._decode(key, observations[key], modality.is_image) for key in modality.keys]
-            features.append(encoder(decoded[0] if len(decoded) == 1 else th.cat(decoded, dim=1)))
+            observation = observations[modality.keys[0]]
+            dtype = self._image_dtype(observation.device) if modality.is_image else th.float32
+            decoded = [self._decode(key, observations[key], modality.is_image, dtype) for key in modality.keys]
+            inputs = decoded[0] if len(decoded) == 1 else th.cat(decoded, dim=1)
+            with th.autocast(observation.device.type, dtype=dtype, enabled=dtype != th.float32):
+                features.append(encoder(inputs).float())
         return th.stack(features, dim=1)
 
-    def _decode(self, key: str, observation: th.Tensor, is_image: bool) -> th.Tensor:
+    def _image_dtype(self, device: th.device) -> th.dtype:
+        bfloat16 = self.precision == "bfloat16" or (self.precision == "auto" and has_native_bfloat16(device.type))
+        return th.bfloat16 if bfloat16 else th.float32
+
+    def _decode(self, key: str, observation: th.Tensor, is_image: bool, dtype: th.dtype) -> th.Tensor:
         if not is_image:
-            return observation.float().flatten(start_dim=1)
-        observation = observation.contiguous(memory_format=th.channels_last)  # cheaper on bytes than on floats
-        values = observation.float()
+            return observation.to(dtype).flatten(start_dim=1)
+        # channels last while still in bytes, arithmetic in float32, then bfloat16: the fastest order on a CPU
+        values = observation.contiguous(memory_format=th.channels_last).float()
         if not self.normalize_images:
-            return values
-        if key in self.signed_keys:
-            return F.threshold(values.sub_(128), -127.5, 0.0, inplace=True).mul_(EVENT_SCALE)  # 0 is "no data"
-        return values.mul_(1 / 255)
+            pass
+        elif key in self.signed_keys:
+            values = F.threshold(values.sub_(128), -127.5, 0.0, inplace=True).mul_(EVENT_SCALE)  # 0 is "no data"
+        else:
+            values = values.mul_(1 / 255)
+        return values.to(dtype)
+
+
+@cache
+def has_native_bfloat16(device_type: str) -> bool:
+    """Whether the hardware multiplies bfloat16 matrices natively: a CPU with AMX, or CUDA from sm80 on."""
+    if device_type == "cuda":
+        return th.cuda.get_device_capability() >= (8, 0)
+    return device_type == "cpu" and th.cpu._is_amx_tile_supported()
 
 
 def _make_modality(name: str, keys: Sequence[str], space: spaces.Dict, normalize_images: bool) -> Modality:

@@ -44,6 +44,7 @@ class MultiModalPolicy(SACPolicy):
     :param encoder_classes: own encoder classes of some modalities
     :param encoder_kwargs: keyword arguments of the encoders of some modalities
     :param signed_keys: image keys of signed counts around 128; by default those with "event" in their name
+    :param precision: arithmetic of the image encoders: "auto", "float32" or "bfloat16"
     :param value_estimation: "have", "lve" or "gve"
     :param refusion: "convex", "monotone" or "free"
     :param attention_dim: p of Eq. 9
@@ -74,6 +75,7 @@ class MultiModalPolicy(SACPolicy):
         encoder_classes: Mapping[str, type[nn.Module]] | None = None,
         encoder_kwargs: Mapping[str, Mapping[str, Any]] | None = None,
         signed_keys: Sequence[str] | None = None,
+        precision: str = "auto",
         value_estimation: str = "have",
         refusion: str = "convex",
         attention_dim: int = 32,
@@ -85,6 +87,7 @@ class MultiModalPolicy(SACPolicy):
             "encoder_classes": encoder_classes,
             "encoder_kwargs": encoder_kwargs,
             "signed_keys": signed_keys,
+            "precision": precision,
         }
         self.value_kwargs: dict[str, Any] = {
             "value_estimation": value_estimation,
@@ -126,7 +129,11 @@ class MultiModalPolicy(SACPolicy):
         self.critic.optimizer = self._make_optimizer(critic_parameters, lr_schedule)
 
     def _make_optimizer(self, parameters: list[nn.Parameter], lr_schedule: Schedule) -> th.optim.Optimizer:
-        return self.optimizer_class(parameters, lr=lr_schedule(1), **self.optimizer_kwargs)  # type: ignore[call-arg]
+        kwargs: dict[str, Any] = (
+            {"fused": True} if self.optimizer_class is th.optim.Adam else {}
+        )  # one kernel for all parameters
+        kwargs.update(self.optimizer_kwargs)
+        return self.optimizer_class(parameters, lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> MultiModalCritic:  # type: ignore[override]
         encoder = MultiModalEncoder(
