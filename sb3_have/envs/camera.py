@@ -156,11 +156,12 @@ class Camera:
 
     def depth(self, objects: Objects) -> Array:
         """
-        Depth of one instant, (height, width): metres along the optical axis, the nearest in each pixel; infinite where
-        a pixel sees the sky.
+        Depth of one instant, (height, width): metres along the optical axis to the nearest object that a sample of the
+        pixel hits, else to the ground; infinite in the sky.
         """
         depth = np.full((self.size, self.size), np.inf, dtype=np.float32)
         depth[self.horizon :] = self.ground_forward
+        depth.reshape(-1)[objects.pixel] = np.inf
         np.minimum.at(depth.reshape(-1), objects.pixel, objects.depth)
         return depth
 
@@ -212,10 +213,10 @@ class Camera:
         s_max = (np.maximum(faces.s_start, faces.s_end) - 1e-4).astype(np.float32)
         return _Projected(instant, np.stack((u, v), axis=-1), plane, s_max, faces.kind, faces.normal, faces.vehicle)
 
-    def _paint(self, instants: int, faces: _Projected) -> NDArray[np.int16]:
+    def _paint(self, instants: int, faces: _Projected) -> NDArray[np.int32]:
         """Number of the face (from 1) that each sample sees, (instants, rows, columns) of samples; 0 for none."""
         side = SUPERSAMPLING * self.size
-        canvas = np.zeros((instants, side, side), dtype=np.int16)
+        canvas = np.zeros((instants, side, side), dtype=np.int32)
         corners = faces.corners * SUPERSAMPLING - 0.5
         # OpenCV paints the outline too, half a sample on each side; a face always keeps one sample.
         corners -= np.clip(corners - corners.mean(axis=1, keepdims=True), -0.5, 0.5)

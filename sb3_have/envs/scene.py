@@ -29,16 +29,17 @@ ALBEDO: Final = np.array(
     ],
     dtype=np.float32,
 )
-#: Paint of vehicles: white, silver, black, red, blue, yellow, green. None is as grey as the road.
+#: Paint of vehicles: white, silver, black, red, blue, yellow, green. None is as bright as the road, which an event
+#: camera could not tell from it.
 PAINTS: Final = np.array(
     [
         (0.80, 0.80, 0.78),
         (0.50, 0.52, 0.54),
         (0.025, 0.025, 0.03),
-        (0.50, 0.04, 0.03),
-        (0.04, 0.08, 0.40),
+        (0.75, 0.08, 0.06),
+        (0.03, 0.05, 0.22),
         (0.75, 0.55, 0.05),
-        (0.04, 0.25, 0.10),
+        (0.08, 0.42, 0.14),
     ],
     dtype=np.float32,
 )

@@ -1,0 +1,190 @@
+"""The camera against pinhole geometry and against a ray caster."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sb3_have.envs.camera import SUPERSAMPLING, Camera, Objects
+from sb3_have.envs.scene import ASPHALT, DASH_LENGTH, DASH_PERIOD, LINE_WIDTH, PAINTS, VEHICLE_HEIGHT
+from sb3_have.envs.weather import LUMA
+
+Array = NDArray[Any]
+SIZE = 128
+FOCAL = SIZE / 2 / np.tan(np.radians(30))
+
+
+def road_camera(size: int = SIZE) -> Camera:
+    return Camera(size, lanes_count=4, lane_width=4.0)
+
+
+def poses(*vehicles: tuple[float, float, float]) -> Array:
+    return np.array([vehicles])
+
+
+def sizes(count: int) -> Array:
+    return np.tile((5.0, 2.0), (count, 1))
+
+
+def look(camera: Camera, at: Array) -> tuple[Array, Array]:
+    """Depth and vehicle number of every pixel, from one instant."""
+    objects = camera.objects(at, sizes(at.shape[1]))
+    return camera.depth(objects), vehicle_mask(camera, objects)
+
+
+def vehicle_mask(camera: Camera, objects: Objects) -> Array:
+    mask = np.full(camera.size**2, -1)
+    far_to_near = np.argsort(-objects.depth)
+    mask[objects.pixel[far_to_near]] = objects.vehicle[objects.face[far_to_near]]
+    return mask.reshape(camera.size, camera.size)
+
+
+@pytest.mark.parametrize("distance", [10.0, 26.5, 60.0])
+def test_car_dead_ahead(distance: float) -> None:
+    # The camera stands 1 m ahead of the ego's centre, the rear of a car 2.5 m behind its own.
+    depth, vehicle = look(road_camera(), poses((100, 4, 0), (100 + 1 + distance + 2.5, 4, 0)))
+    rows, columns = np.nonzero(vehicle == 0)
+    np.testing.assert_allclose(depth[rows, columns], distance, rtol=1e-5)
+    assert np.ptp(columns) + 1 == pytest.approx(FOCAL * 2 / distance, abs=1.5)
+    assert columns.mean() + 0.5 == pytest.approx(SIZE / 2, abs=0.5)
+    assert rows.min() == SIZE // 2  # as high as the camera: its roof lies on the horizon
+    assert rows.max() + 1 == pytest.approx(SIZE / 2 + FOCAL * 1.5 / distance, abs=1)
+
+
+@pytest.mark.parametrize("lateral", [-4.0, 4.0])
+def test_right_is_to_the_right(lateral: float) -> None:
+    _, vehicle = look(road_camera(), poses((0, 6, 0), (43.5, 6 + lateral, 0)))
+    columns = np.nonzero(vehicle == 0)[1]
+    assert columns.mean() + 0.5 == pytest.approx(SIZE / 2 + FOCAL * lateral / 40, abs=2)
+    assert np.sign(columns.mean() - SIZE / 2) == np.sign(lateral)
+
+
+def test_turning_right_moves_the_scene_to_the_left() -> None:
+    heading = 0.1
+    depth, vehicle = look(road_camera(), poses((0, 6, heading), (43.5, 6, 0)))
+    columns = np.nonzero(vehicle == 0)[1]
+    assert columns.mean() + 0.5 == pytest.approx(SIZE / 2 - FOCAL * np.tan(heading), abs=3)
+    # The middle of its rear in the turned camera.
+    forward = np.cos(heading) * (41 - np.cos(heading)) - np.sin(heading) ** 2
+    middle = np.round(SIZE / 2 - FOCAL * np.tan(heading)).astype(int)
+    assert depth[SIZE // 2 + 1, middle] == pytest.approx(forward, rel=5e-3)
+
+
+@pytest.mark.parametrize("size", [63, 64])
+def test_ground_depth(size: int) -> None:
+    camera = road_camera(size)
+    depth, vehicle = look(camera, poses((0, 6, 0)))
+    focal = size / 2 / np.tan(np.radians(30))
+    rows = np.arange(size * 5 // 8, size)
+    np.testing.assert_allclose(depth[rows, size // 2], focal * 1.5 / (rows + 0.5 - size / 2), rtol=1e-5)
+    assert np.isinf(depth[: size // 2, size // 2]).all() and (vehicle == -1).all()
+    assert not np.isnan(depth).any() and (depth > 0).all()
+
+
+def test_nearer_hides_farther_and_behind_is_not_seen() -> None:
+    at = poses((0, 4, 0), (60, 4, 0), (20, 4, 0), (-20, 4, 0), (3000, 4, 0))
+    _, vehicle = look(road_camera(), at)
+    assert set(np.unique(vehicle)) == {-1, 1}
+
+
+def test_car_alongside_is_clipped_at_the_image_plane() -> None:
+    for x in np.linspace(-3, 8, 12):
+        depth, vehicle = look(road_camera(), poses((0, 4, 0.02), (x, 7.0, -0.02), (x + 3, 1.0, 0.0)))
+        assert np.isfinite(depth[vehicle >= 0]).all() and (depth > 0).all()
+        assert (np.nonzero(vehicle == 0)[1] > SIZE / 2).all() and (np.nonzero(vehicle == 1)[1] < SIZE / 2).all()
+
+
+def cast(at: Array, size: int) -> Array:
+    """Depth of the nearest vehicle in the centre of each pixel, by cutting rays with boxes; infinite for none."""
+    x, y, heading = at[0]
+    origin = np.array([x + np.cos(heading), y + np.sin(heading), 1.5])
+    slope = (np.arange(size) + 0.5 - size / 2) * (2 * np.tan(np.radians(30)) / size)
+    right, down = np.meshgrid(slope, slope)
+    direction = np.stack(
+        (np.cos(heading) - right * np.sin(heading), np.sin(heading) + right * np.cos(heading), -down), axis=-1
+    )
+    nearest = np.full((size, size), np.inf)
+    for cx, cy, turn in at[1:]:
+        turned = np.array([[np.cos(turn), np.sin(turn), 0], [-np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+        start, ray = turned @ (origin - (cx, cy, 0)), direction @ turned.T
+        low, high = np.array([-2.5, -1.0, 0.0]), np.array([2.5, 1.0, VEHICLE_HEIGHT])
+        with np.errstate(divide="ignore"):
+            first, second = (low - start) / ray, (high - start) / ray
+        enter, leave = np.minimum(first, second).max(axis=-1), np.maximum(first, second).min(axis=-1)
+        hit = (enter < leave) & (enter > 0)
+        nearest = np.where(hit, np.minimum(nearest, enter), nearest)
+    return nearest
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_agrees_with_a_ray_caster(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = 12
+    at = np.zeros((1, 1 + count, 3))
+    at[0, 0] = 200.0, 6.0, rng.uniform(-0.1, 0.1)
+    at[0, 1:] = np.stack(
+        (212 + 8 * rng.permutation(count), 4.0 * rng.integers(4, size=count), rng.normal(0, 0.05, count)), axis=-1
+    )
+    depth, vehicle = look(road_camera(), at)
+    fine = cast(at[0], SUPERSAMPLING * SIZE)
+    expected = fine.reshape(SIZE, SUPERSAMPLING, SIZE, SUPERSAMPLING).min(axis=(1, 3))
+    seen = np.isfinite(expected)
+    both = seen & (vehicle >= 0)
+    assert both.sum() > 300
+    # A sample on an outline may fall on either side of it.
+    assert both.sum() / (seen | (vehicle >= 0)).sum() > 0.98
+    assert (np.abs(depth[both] / expected[both] - 1) < 0.01).mean() > 0.99
+
+
+def test_instants_in_one_pass_equal_one_at_a_time() -> None:
+    at = np.repeat(poses((0, 4, 0.01), (20, 4, 0), (35, 8, 0), (60, 0, 0)), 3, axis=0)
+    at[:, 0, 0] = 0, 1, 2
+    camera = road_camera(64)
+    together = camera.objects(at, sizes(4))
+    last = together.last(3, 64**2)
+    alone = camera.objects(at[2:], sizes(4))
+    visible = alone.vehicle[alone.face] >= 0  # the guard-rails begin where the first instant has them
+    np.testing.assert_array_equal(alone.pixel[visible], last.pixel[last.vehicle[last.face] >= 0])
+    np.testing.assert_array_equal(alone.depth[visible], last.depth[last.vehicle[last.face] >= 0])
+    np.testing.assert_array_equal(camera.ground(at).marking[2], camera.ground(at[2:]).marking[0])
+
+
+def test_markings_lie_where_the_lanes_end() -> None:
+    camera = road_camera()
+    ground = camera.ground(poses((0, 12, 0)))  # the right-most lane: its solid edge lies 2 m to the right
+    row = 12
+    forward, pixel = float(camera.ground_forward[row, 0]), float(camera.ground_forward[row, 0]) / FOCAL
+    marking = ground.marking[0, row]
+    across = camera.ground_right[row]
+    edge = np.abs(across - 2) < 1
+    assert forward == pytest.approx(1.5 * FOCAL / 12.5)
+    assert marking[edge].sum() * pixel == pytest.approx(LINE_WIDTH, rel=1e-3)
+    assert (marking * across)[edge].sum() / marking[edge].sum() == pytest.approx(2, abs=0.02)
+    assert marking[np.abs(across) < 1].max() == 0  # nothing in the middle of the lane
+
+
+def test_lane_lines_are_dashed() -> None:
+    camera = road_camera()
+    share = []
+    for x in np.arange(0, DASH_PERIOD, 0.5):
+        marking = camera.ground(poses((x, 12, 0))).marking[0, 12]
+        line = np.abs(camera.ground_right[12] + 2) < 1
+        share.append(marking[line].sum() * camera.ground_forward[12, 0] / FOCAL / LINE_WIDTH)
+    assert np.mean(share) == pytest.approx(DASH_LENGTH / DASH_PERIOD, rel=0.02)
+    assert min(share) == pytest.approx(0, abs=1e-3) and max(share) == pytest.approx(1, rel=1e-2)
+
+
+def test_looks_the_same_far_down_the_road() -> None:
+    camera = road_camera(64)
+    here, there = camera.ground(poses((3.0, 4, 0))), camera.ground(poses((3.0 + 240 * 50, 4, 0)))
+    np.testing.assert_allclose(here.marking, there.marking, atol=1e-4)
+    at = poses((3.0, 4, 0), (30, 4, 0))
+    far = at + np.array((240.0 * 50, 0, 0))
+    np.testing.assert_allclose(look(camera, at)[0], look(camera, far)[0], rtol=1e-5)
+
+
+def test_every_paint_stands_out_from_the_road_by_its_brightness() -> None:
+    # A vertical face gets about half the light of the road; an event camera needs a contrast of its threshold, 0.2.
+    contrast = np.log(0.55 * (PAINTS @ LUMA) / (ASPHALT @ LUMA))
+    assert np.abs(contrast).min() > 0.25
