@@ -94,9 +94,14 @@ def make_training_env(env_id: str, config: Mapping[str, Any], out: Path | None =
         return Monitor(env, str(file), info_keywords=keywords, override_existing=not file.exists())
 
     n_envs = config.get("n_envs", 1)
-    makers = [partial(make, index) for index in range(n_envs)]
+    makers: list[Callable[[], gym.Env[Any, Any]]] = [partial(make, index) for index in range(n_envs)]
     vec_env: VecEnv = SubprocVecEnv(makers) if n_envs > 1 else DummyVecEnv(makers)
     return VecFrameStack(vec_env, config["frame_stack"]) if config.get("frame_stack", 1) > 1 else vec_env
+
+
+def evaluation_env_kwargs(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The ``env_kwargs`` of a configuration without the weather, which :func:`evaluate` sets itself."""
+    return {key: value for key, value in config.get("env_kwargs", {}).items() if key != "weather"}
 
 
 def model_kwargs(config: Mapping[str, Any]) -> dict[str, Any]:
@@ -267,7 +272,7 @@ class Run:
             kept = int((rows["l"].cumsum() <= step / self.config.get("n_envs", 1)).sum())
             _write_atomically(path, partial(Path.write_text, data="".join([head, *lines[: kept + 1]])))
 
-    def save(self, model: OffPolicyAlgorithm) -> None:
+    def save(self, model: Any) -> None:
         """Write ``checkpoint-<step>``: it appears complete or not at all, and then the older one goes."""
         older = newest_checkpoint(self.out)
         target = self.out / f"checkpoint-{model.num_timesteps}"
@@ -286,9 +291,14 @@ class Run:
 
     def evaluate(self, model: Any, step: int) -> None:
         """Append a row per weather to ``evaluation.csv`` and print their mean."""
-        env_kwargs = {key: value for key, value in self.config.get("env_kwargs", {}).items() if key != "weather"}
         frame = evaluate(
-            model, self.env_id, self.weathers, self.eval_episodes, EVALUATION_SEED, env_kwargs, n_envs=self.eval_envs
+            model,
+            self.env_id,
+            self.weathers,
+            self.eval_episodes,
+            EVALUATION_SEED,
+            evaluation_env_kwargs(self.config),
+            n_envs=self.eval_envs,
         )
         frame.insert(0, "step", step)
         frame.insert(1, "seed", self.seed)

@@ -118,7 +118,7 @@ def _drive(
     episodes: list[list[dict[str, Any]]] = [[] for _ in quotas]
     returns, steps = np.zeros(len(quotas)), np.zeros(len(quotas), dtype=int)
     observations = vec_env.reset()
-    infos: list[dict[str, Any]] = list(vec_env.reset_infos)
+    infos: list[dict[str, Any]] = list(vec_env.unwrapped.reset_infos)
     state, starts = None, np.ones(len(quotas), dtype=bool)
     while any(len(done) < quota for done, quota in zip(episodes, quotas, strict=True)):
         if hasattr(model, "read_infos"):
@@ -128,7 +128,7 @@ def _drive(
         returns += rewards
         steps += 1
         # after the end of an episode the newest info is that of the reset
-        infos = [vec_env.reset_infos[i] if done else step_infos[i] for i, done in enumerate(starts)]
+        infos = [vec_env.unwrapped.reset_infos[i] if done else step_infos[i] for i, done in enumerate(starts)]
         for i in np.flatnonzero(starts):
             if len(episodes[i]) < quotas[i]:
                 told = {key: float(step_infos[i].get(key, np.nan)) for key in ("distance", "crashed", "offroad")}
@@ -200,7 +200,7 @@ class EpisodeQueue(gym.Env[Any, Any]):
         self._next, self._weather = 0, ""
         self._make(self._tasks[0].weather)
         self.observation_space, self.action_space = self._env.observation_space, self._env.action_space
-        self.render_mode = self._env.render_mode
+        self.render_mode, self.metadata = self._env.render_mode, self._env.metadata
 
     def _make(self, weather: str) -> None:
         if weather != self._weather:
@@ -214,15 +214,15 @@ class EpisodeQueue(gym.Env[Any, Any]):
         if not self._idle:
             task = self._tasks[self._next]
             self._make(task.weather)
-            self._observation, self._info = self._env.reset(seed=task.seed)
+            self.observation, self._info = self._env.reset(seed=task.seed)
             self._next += 1
-        return self._observation, self._info
+        return self.observation, self._info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         if self._idle:
-            return self._observation, 0.0, False, False, self._info
-        self._observation, reward, terminated, truncated, info = self._env.step(action)
-        return self._observation, float(reward), terminated, truncated, info
+            return self.observation, 0.0, False, False, self._info
+        self.observation, reward, terminated, truncated, info = self._env.step(action)
+        return self.observation, float(reward), terminated, truncated, info
 
     def render(self) -> Any:
         return self._env.render()

@@ -1,0 +1,130 @@
+"""Train HAVESAC on HighwayVision-v0 for some minutes, compare it with rule-based drivers, and show what it does.
+
+    python -m sb3_have.demo [--steps N] [--seed S] [--out runs/demo]
+
+Hyper-parameters are those of ``zoo_configs/havesac.yml``; :mod:`sb3_have.train` is the same for a long run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import torch as th
+from stable_baselines3.common.monitor import load_results
+
+from sb3_have.common.drivers import KeepStraightDriver, RandomDriver
+from sb3_have.common.evaluation import Predictor, evaluate, format_table
+from sb3_have.common.plotting import plot_learning_curve, plot_modality_weights, write_gif
+from sb3_have.common.recording import record_episode
+from sb3_have.envs.weather import WEATHERS
+from sb3_have.train import Run, evaluation_env_kwargs, load_config
+
+ENV_ID = "HighwayVision-v0"
+STEPS = 8_000
+MINUTES = 9.5
+"""Training stops here on a slow machine, so that the whole demo stays within a quarter of an hour."""
+EPISODES = 2
+PROCESSES = 2
+SHOWN = "HardRainNight"
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Command line of ``python -m sb3_have.demo``."""
+    parser = argparse.ArgumentParser(prog="python -m sb3_have.demo", description=(__doc__ or "").splitlines()[0])
+    steps = int(os.environ.get("DEMO_STEPS", STEPS))
+    parser.add_argument("--steps", type=int, default=steps, help=f"of training; default: $DEMO_STEPS or {STEPS}")
+    parser.add_argument("--minutes", type=float, default=MINUTES, help="of training at most; default: %(default)s")
+    parser.add_argument("--episodes", type=int, default=EPISODES, help="per weather and driver; default: %(default)s")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--out", type=Path, default=Path("runs/demo"))
+    args = parser.parse_args(arguments)
+    try:
+        demo(args.steps, 60 * args.minutes, args.episodes, args.seed, args.out)
+    except KeyboardInterrupt:
+        print(f"\nInterrupted; what was finished is in {args.out}.", file=sys.stderr)
+        sys.exit(130)
+
+
+def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -> dict[str, pd.DataFrame]:
+    """Train, evaluate, draw.
+
+    :param steps: of training
+    :param time_limit: of the training [s]
+    :param n_episodes: to evaluate each driver with in each weather
+    :param seed: of training; the evaluation's episodes are the same for every seed
+    :param out: folder for the results
+    :return: the evaluation of each driver
+    """
+    started = time.monotonic()
+    config = load_config("havesac", ENV_ID)
+    run = Run(config, ENV_ID, out, seed=seed, eval_freq=0, save_freq=0, time_limit=time_limit)
+    with phase(f"Training for {steps} steps or {time_limit / 60:g} minutes (Ctrl-C: go on with what is learned)"):
+        model = run.train(steps, progress_bar=True, keep_checkpoint=False)
+        (out / "model.zip").replace(out / "havesac_demo.zip")
+        print(
+            f"{model.num_timesteps} steps in {run.seconds:.0f} s, {1e3 * run.seconds / model.num_timesteps:.0f} ms each"
+        )
+
+    # the environments' processes need the cores now
+    th.set_num_threads(1)
+    env_kwargs = evaluation_env_kwargs(config)
+    drivers: dict[str, Predictor] = {
+        "HAVESAC": model,
+        "random": RandomDriver(seed),
+        "keep straight": KeepStraightDriver(),
+    }
+    with phase(f"Evaluating {len(drivers)} drivers, {n_episodes} episodes in each of {len(WEATHERS)} weathers"):
+        results = {
+            name: evaluate(
+                driver, ENV_ID, WEATHERS, n_episodes, env_kwargs=env_kwargs, n_envs=PROCESSES, progress_bar=True
+            )
+            for name, driver in drivers.items()
+        }
+        table = pd.concat(results, names=["driver"]).reset_index(level="driver").reset_index(drop=True)
+        table.to_csv(out / "evaluation.csv", index=False)
+        print(format_table(results))
+
+    with phase("Drawing"):
+        draw(model, results, env_kwargs, out)
+    print(f"Everything is in {out} after {(time.monotonic() - started) / 60:.1f} minutes.")
+    return results
+
+
+def draw(model: Any, results: dict[str, pd.DataFrame], env_kwargs: dict[str, Any], out: Path) -> None:
+    """Write the pictures of the demo.
+
+    :param model: trained
+    :param results: of :func:`evaluate`, by driver
+    :param env_kwargs: of the evaluation
+    :param out: folder, with the ``monitor.csv`` of the training
+    """
+    others = {name: float(frame["distance_mean"].mean()) for name, frame in results.items() if name != "HAVESAC"}
+    curve = plot_learning_curve(load_results(str(out)), references=others)
+    curve.savefig(out / "learning_curve.png", dpi=120)
+    recording = record_episode(model, ENV_ID, SHOWN, env_kwargs=env_kwargs)
+    plot_modality_weights(recording).savefig(out / "modality_weights.png", dpi=120)
+    write_gif(recording, out / "drive.gif")
+
+
+@contextmanager
+def phase(title: str) -> Iterator[None]:
+    """Print what happens and how long it took.
+
+    :param title: of the phase
+    """
+    print(f"\n== {title}", flush=True)
+    started = time.monotonic()
+    yield
+    print(f"-- {time.monotonic() - started:.0f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()
