@@ -7,14 +7,14 @@ camera works on the logarithm and hardly notices.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_have.envs.camera import Camera, Ground, Objects
+from sb3_have.envs.camera import SUPERSAMPLING, Camera, Ground, Objects
 from sb3_have.envs.scene import ALBEDO, ASPHALT, LAMP, MARKING, PAINTS, VERGE, Array
 
 Colour = tuple[float, float, float]
@@ -32,7 +32,8 @@ class Weather:
     :param ambient: Irradiance from the sky on a horizontal surface.
     :param zenith: Radiance of the sky above.
     :param horizon: Radiance of the sky at the horizon, and of fog.
-    :param exposure: Digital value (1 = full well) of a white surface per unit of radiance.
+    :param exposure: Share of the colour camera's full well per unit of radiance. A night is exposed 40 times as long as
+        a clear noon, the most that a moving camera can afford, and stays dark.
     :param wetness: 0 (dry) to 1 (standing water): the road darkens and mirrors the sky.
     :param extinction: Share of light lost per metre to rain and mist.
     :param rain: 0 (none) to 1 (hard): streaks in the colour image, false events.
@@ -55,13 +56,6 @@ def _night(level: float, warmth: float = 0.0) -> Colour:
     return (level * (0.75 + 0.45 * warmth), level * (0.9 + 0.1 * warmth), level * (1.25 - 0.45 * warmth))
 
 
-CLEAR_NOON: Final = Weather(
-    sun=(0.82, 0.80, 0.74),
-    ambient=(0.17, 0.20, 0.27),
-    zenith=(0.16, 0.30, 0.58),
-    horizon=(0.44, 0.54, 0.66),
-    exposure=1.0,
-)
 _WEATHERS: Final = {
     "ClearNight": Weather(
         sun=_night(1.2e-4),
@@ -99,7 +93,13 @@ _WEATHERS: Final = {
         wetness=0.7,
         night=True,
     ),
-    "ClearNoon": CLEAR_NOON,
+    "ClearNoon": Weather(
+        sun=(0.82, 0.80, 0.74),
+        ambient=(0.17, 0.20, 0.27),
+        zenith=(0.16, 0.30, 0.58),
+        horizon=(0.44, 0.54, 0.66),
+        exposure=1.0,
+    ),
     "CloudyNoon": Weather(
         sun=(0.0, 0.0, 0.0),
         ambient=(0.40, 0.41, 0.43),
@@ -143,9 +143,9 @@ def weather_by_name(name: str) -> Weather:
 
 #: Unit vector towards the sun (forward, right, up): high, behind the ego and to its left, so rear faces are lit.
 SUN_DIRECTION: Final = np.array((-0.45, -0.30, 0.84))
-#: The sun's rays reach a vertical face under this share of the sky.
+#: Share of the sky's light that reaches a vertical face.
 SKY_ON_WALLS: Final = 0.55
-#: Low beam: irradiance at 1 m, reach in metres, half-width of the beam as tan(angle).
+#: Low beam: irradiance next to the lamp, reach in metres (nothing is left of it at 30 m), tan of its half-width.
 HEADLIGHT: Final = 0.08
 HEADLIGHT_COLOUR: Final[Colour] = (1.0, 0.94, 0.80)
 HEADLIGHT_REACH: Final = 13.0
@@ -156,7 +156,6 @@ TAIL_LIGHT: Final[Colour] = (6e-4, 4e-5, 3e-5)
 RAIN_EVENT_RATE: Final = 1.5
 
 
-@dataclass
 class Illumination:
     """
     A weather seen through a camera: all that does not depend on the vehicles, computed once per episode.
@@ -167,18 +166,12 @@ class Illumination:
     :param colour: True for red, green and blue; False for brightness alone.
     """
 
-    weather: Weather
-    camera: Camera
-    paint: NDArray[np.int64]
-    colour: bool
-    albedo: Array = field(init=False)
-
-    def __post_init__(self) -> None:
-        weather, camera = self.weather, self.camera
+    def __init__(self, weather: Weather, camera: Camera, paint: NDArray[np.int64], colour: bool) -> None:
+        self.weather, self.camera, self.colour = weather, camera, colour
         self.sun, self.ambient, self.horizon = map(self._light, (weather.sun, weather.ambient, weather.horizon))
         self.beam = self._light(HEADLIGHT_COLOUR) * np.float32(HEADLIGHT * weather.night)
         self.tail = self._light(TAIL_LIGHT) * np.float32(weather.night)
-        self.albedo = self._light(np.concatenate((ALBEDO, PAINTS[self.paint])))
+        self.albedo = self._light(np.concatenate((ALBEDO, PAINTS[paint])))
         wet = np.float32(1 - 0.45 * weather.wetness)
         self.asphalt, self.marking = self._light(ASPHALT) * wet, self._light(MARKING) * (0.5 + 0.5 * wet)
         self.verge = self._light(VERGE) * (0.5 + 0.5 * wet)
@@ -229,13 +222,13 @@ class Illumination:
 
         shade = self._shade(objects)
         flat = image.reshape(-1, image.shape[-1])
-        samples = np.float32(1 / 4)
+        share = np.float32(SUPERSAMPLING**-2)  # of a pixel that one sample covers
         cover = np.bincount(objects.pixel, minlength=len(flat))
         hit = np.flatnonzero(cover)
-        flat[hit] *= 1 - cover[hit, None].astype(np.float32) * samples
+        flat[hit] *= 1 - cover[hit, None].astype(np.float32) * share
         for channel in range(flat.shape[1]):
             total = np.bincount(objects.pixel, weights=shade[:, channel], minlength=len(flat))
-            flat[hit, channel] += total[hit].astype(np.float32) * samples
+            flat[hit, channel] += total[hit].astype(np.float32) * share
         return image
 
     def _shade(self, objects: Objects) -> Array:
@@ -298,7 +291,7 @@ def rain_events(
     weather: Weather, t0: float, t1: float, height: int, width: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """
-    False events of drops that cross the view within microseconds: short vertical runs of one polarity.
+    False events of drops that cross the view within milliseconds: short vertical runs of one polarity.
 
     :param weather: The weather; no rain, no events.
     :param t0: Start of the interval in seconds.
@@ -306,7 +299,7 @@ def rain_events(
     :return: Pixel index, time and polarity, as :meth:`EventCamera.detect` returns them.
     """
     run = max(2, height // 24)
-    rate = weather.rain * RAIN_EVENT_RATE * height * width / run
+    rate = weather.rain * RAIN_EVENT_RATE * (height + run - 1) * width / run
     drops = int(rng.poisson(rate * (t1 - t0))) if rate else 0
     column = rng.integers(width, size=drops)
     row = rng.integers(1 - run, height, size=drops)
