@@ -1,7 +1,7 @@
 """Is the driving task of HighwayVision-v0 learnable at all, and which choices decide it? No pixels: a state vector.
 
-    python -m benchmarks.state_learnability drivers                                # rule-based drivers, 20 episodes each
-    python -m benchmarks.state_learnability train --settings default --seeds 0 1   # stock SAC, both seeds side by side
+    python -m benchmarks.state_learnability drivers                                # drivers that do not learn
+    python -m benchmarks.state_learnability train --settings default --seeds 0 1   # stock SAC, two seeds at a time
 
 Every evaluation is appended to ``benchmarks/results/state_learnability.csv`` as it is made.
 """
@@ -53,11 +53,12 @@ SETTINGS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "10_hz": ({"policy_frequency": 10, "max_episode_steps": 1000}, {}),
     "start_20": ({"initial_speed": 20.0}, {}),
     "free_brake": ({"brake_cost": 0.0}, {}),
+    "even_traffic": ({"traffic_speed": (21.0, 24.0)}, {}),
     "no_costs": ({"brake_cost": 0.0, "steer_cost": 0.0}, {}),
 }
 
 
-class StateObservation(ObservationType):
+class StateObservation(ObservationType):  # type: ignore[misc]  # highway-env is untyped
     """19 values: own lateral position, offset from the lane's centre, heading and speed, and for the lane to the left,
     the own and the one to the right: whether it exists, gap and speed difference to the next vehicle ahead and behind.
     """
@@ -113,6 +114,7 @@ def evaluate(env: HighwayVisionEnv, driver: Driver, seeds: Iterable[int]) -> dic
     """Drive one episode per seed."""
     distances, returns, reasons = [], [], []
     for seed in seeds:
+        state: Any  # the sensors' Dict in general, a vector here
         state, info = env.reset(seed=seed)
         done, total = False, 0.0
         while not done:

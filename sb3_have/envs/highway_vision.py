@@ -14,7 +14,7 @@ from highway_env.envs.common.observation import ObservationType
 from highway_env.vehicle.kinematics import Vehicle
 
 from sb3_have.envs import traffic
-from sb3_have.envs.road import LANE_WIDTH, HighwayNetwork, HighwayRoad
+from sb3_have.envs.road import LANE_WIDTH, SPEED_LIMIT, HighwayNetwork, HighwayRoad
 from sb3_have.envs.vision import VisionSensors, compose
 from sb3_have.envs.weather import WEATHERS
 
@@ -26,6 +26,7 @@ class EgoVehicle(Vehicle):
     """highway-env's vehicle, whose speed never leaves its range (the stock one drifts backwards after braking)."""
 
     MIN_SPEED = 0.0
+    speed: float
 
     def step(self, dt: float) -> None:
         super().step(dt)
@@ -65,6 +66,7 @@ class HighwayVisionEnv(AbstractEnv):
     :param modalities: any of "rgb", "event", "depth"
     :param image_size: height and width of the images [px]
     :param vehicles_count: other vehicles in the window of 440 m
+    :param traffic_speed: range of the speeds the others want to drive at [m/s]
     :param lanes_count: number of lanes
     :param max_episode_steps: control steps per episode, or None for no limit
     :param initial_speed: of the ego vehicle [m/s], in 0 to ``max_speed``
@@ -81,7 +83,8 @@ class HighwayVisionEnv(AbstractEnv):
     :raises ValueError: for any option outside of what is stated here
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 (declared so by gymnasium)
+    observation_space: spaces.Space[Any]
 
     def __init__(
         self,
@@ -89,6 +92,7 @@ class HighwayVisionEnv(AbstractEnv):
         modalities: Sequence[str] = ("rgb", "event", "depth"),
         image_size: int = 84,
         vehicles_count: int = 20,
+        traffic_speed: tuple[float, float] = (12.0, 24.0),
         lanes_count: int = 4,
         max_episode_steps: int | None = 500,
         initial_speed: float = 0.0,
@@ -124,15 +128,22 @@ class HighwayVisionEnv(AbstractEnv):
                 raise ValueError(f"{name} must be positive, got {positive!r}")
         if not 0 <= initial_speed <= max_speed:
             raise ValueError(f"initial_speed must lie in 0..max_speed ({max_speed} m/s), got {initial_speed!r}")
+        if not 0 < traffic_speed[0] <= traffic_speed[1] <= SPEED_LIMIT:
+            raise ValueError(f"traffic_speed must be a range within 0..{SPEED_LIMIT} m/s, got {traffic_speed!r}")
         for name, weight in [("steer_cost", steer_cost), ("brake_cost", brake_cost), ("crash_penalty", crash_penalty)]:
             if not (np.isfinite(weight) and weight >= 0):
                 raise ValueError(f"{name} must be >= 0 (it is subtracted from the reward), got {weight!r}")
 
         self.weathers = _weather_choices(weather)
         self.vehicles_count, self.lanes_count = int(vehicles_count), int(lanes_count)
+        self.traffic_speed = (float(traffic_speed[0]), float(traffic_speed[1]))
         self.max_episode_steps, self.initial_speed = max_episode_steps, float(initial_speed)
         self.steering_range, self.max_speed = float(steering_range), float(max_speed)
-        self.steer_cost, self.brake_cost, self.crash_penalty = steer_cost, brake_cost, crash_penalty
+        self.steer_cost, self.brake_cost, self.crash_penalty = (
+            float(steer_cost),
+            float(brake_cost),
+            float(crash_penalty),
+        )
         self.sensors = VisionSensors(
             image_size=image_size,
             modalities=modalities,
@@ -206,14 +217,12 @@ class HighwayVisionEnv(AbstractEnv):
         ego.MAX_SPEED = self.max_speed
         self.road.vehicles.append(ego)
         self.vehicle = ego
-        traffic.populate(self.road, ego, self.vehicles_count, self.np_random)
+        traffic.populate(self.road, ego, self.vehicles_count, self.traffic_speed, self.np_random)
         self._elapsed_steps = 0
         self._distance = self._progress = 0.0
         self._poses: list[np.ndarray] = []
 
-    def step(
-        self, action: np.ndarray
-    ) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[dict[str, np.ndarray], float, bool, bool, dict[str, Any]]:
         """Hold ``action`` for one control step.
 
         :param action: [throttle, steer], shape (2,), clipped to -1..1
@@ -224,7 +233,7 @@ class HighwayVisionEnv(AbstractEnv):
             raise ValueError(f"action must be two finite numbers [throttle, steer], got {action!r}")
         if self._elapsed_steps and (self._is_terminated() or self._is_truncated()):
             gym.logger.warn("step() called after the end of the episode; what it returns is undefined. Call reset().")
-        traffic.recycle(self.road, self.vehicle, self.np_random)
+        traffic.recycle(self.road, self.vehicle, self.traffic_speed, self.np_random)
         self._poses = [self._snapshot()]
         self._elapsed_steps += 1
         return super().step(np.clip(action, -1.0, 1.0))  # type: ignore[no-any-return]
@@ -237,7 +246,7 @@ class HighwayVisionEnv(AbstractEnv):
 
     def _reward(self, action: np.ndarray) -> float:
         throttle, steer = (float(a) for a in action)
-        v_s = self._progress * self.config["policy_frequency"]
+        v_s: float = self._progress * self.config["policy_frequency"]
         reward = v_s / self.max_speed - self.steer_cost * abs(steer) - self.brake_cost * max(0.0, -throttle)
         return reward - self.crash_penalty * self._is_terminated()
 

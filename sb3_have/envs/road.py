@@ -20,6 +20,9 @@ LANE_WIDTH: float = StraightLane.DEFAULT_WIDTH
 ROAD_LENGTH = 1e6
 """Longer than any episode drives [m]."""
 
+SPEED_LIMIT = 30.0
+"""No traffic wants to be faster [m/s]; highway-env's default."""
+
 
 class AxisLane(StraightLane):
     """A straight lane along +x: its coordinates are differences, no dot product is needed."""
@@ -32,16 +35,15 @@ class HighwayNetwork(RoadNetwork):
     """Parallel lanes along +x.
 
     :param lanes_count: number of lanes; lane 0 is the leftmost
-    :param speed_limit: of the traffic [m/s]
     """
 
-    def __init__(self, lanes_count: int, speed_limit: float = 30.0) -> None:
+    def __init__(self, lanes_count: int) -> None:
         super().__init__()
         for k in range(lanes_count):
             y = k * LANE_WIDTH
             left = LineType.CONTINUOUS_LINE if k == 0 else LineType.STRIPED
             right = LineType.CONTINUOUS_LINE if k == lanes_count - 1 else LineType.NONE
-            lane = AxisLane([0.0, y], [ROAD_LENGTH, y], line_types=(left, right), speed_limit=speed_limit)
+            lane = AxisLane([0.0, y], [ROAD_LENGTH, y], line_types=(left, right), speed_limit=SPEED_LIMIT)
             self.add_lane("0", "1", lane)
 
     def get_closest_lane_index(self, position: np.ndarray, heading: float | None = None) -> LaneIndex:
@@ -66,7 +68,7 @@ class HighwayRoad(Road):
         self, vehicle: Vehicle, lane_index: LaneIndex | None = None
     ) -> tuple[Vehicle | None, Vehicle | None]:
         if self._on_lane is None:
-            return super().neighbour_vehicles(vehicle, lane_index)
+            return super().neighbour_vehicles(vehicle, lane_index)  # type: ignore[no-any-return]
         lane_index = lane_index or vehicle.lane_index
         lane = self.network.get_lane(lane_index)
         if lane_index not in self._on_lane:

@@ -18,11 +18,11 @@ AHEAD = SIGHT + 20.0
 """Front end of the window, ahead of the ego vehicle [m]; arrivals are spread over the last 20 m."""
 BEHIND = 120.0
 """Rear end of the window, behind the ego vehicle [m]; arrivals are spread over the last 20 m."""
-SPEED_RANGE = (21.0, 24.0)
-"""Range of the desired speeds [m/s], highway-env's 70 to 80% of its 30 m/s limit."""
 
 
-def populate(road: Road, ego: Vehicle, count: int, rng: np.random.Generator, tries: int = 100) -> None:
+def populate(
+    road: Road, ego: Vehicle, count: int, speeds: tuple[float, float], rng: np.random.Generator, tries: int = 100
+) -> None:
     """Add ``count`` vehicles to the road, uniformly over the window, with room to everyone around.
 
     Room means that nobody starts nearer to the one in front than the gap IDM itself wants, at the speeds of both; for
@@ -32,24 +32,26 @@ def populate(road: Road, ego: Vehicle, count: int, rng: np.random.Generator, tri
     :param road: holds the ego vehicle already
     :param ego: the ego vehicle
     :param count: number of vehicles to add
+    :param speeds: range of the speeds they want to drive at [m/s]
     :param rng: source of all randomness
     :param tries: how often a place is drawn for each vehicle
     """
     for i in range(count):
         for _ in range(tries):
-            vehicle = _random_vehicle(road, ego.position[0] + rng.uniform(-BEHIND, AHEAD), rng)
+            vehicle = _random_vehicle(road, ego.position[0] + rng.uniform(-BEHIND, AHEAD), speeds, rng)
             if _has_room(vehicle):
                 break
         else:
-            vehicle = _random_vehicle(road, ego.position[0] + AHEAD + 50.0 * (i + 1), rng)
+            vehicle = _random_vehicle(road, ego.position[0] + AHEAD + 50.0 * (i + 1), speeds, rng)
         road.vehicles.append(vehicle)
 
 
-def recycle(road: Road, ego: Vehicle, rng: np.random.Generator) -> list[int]:
+def recycle(road: Road, ego: Vehicle, speeds: tuple[float, float], rng: np.random.Generator) -> list[int]:
     """Bring vehicles that left the window at one end back at the other, where there is room; the rest waits.
 
     :param road: its ``vehicles`` keep their order, a recycled one is replaced in place
     :param ego: the ego vehicle, never recycled
+    :param speeds: range of the speeds they want to drive at [m/s]
     :param rng: source of all randomness
     :return: indices into ``road.vehicles`` of the vehicles that were replaced
     """
@@ -59,16 +61,16 @@ def recycle(road: Road, ego: Vehicle, rng: np.random.Generator) -> list[int]:
         if vehicle is ego or -BEHIND <= offset <= AHEAD:
             continue
         arrival = rng.uniform(SIGHT, AHEAD) if offset < 0 else rng.uniform(-BEHIND, -BEHIND + AHEAD - SIGHT)
-        newcomer = _random_vehicle(road, ego.position[0] + arrival, rng)
+        newcomer = _random_vehicle(road, ego.position[0] + arrival, speeds, rng)
         if _has_room(newcomer):
             road.vehicles[i] = newcomer
             replaced.append(i)
     return replaced
 
 
-def _random_vehicle(road: Road, x: float, rng: np.random.Generator) -> IDMVehicle:
+def _random_vehicle(road: Road, x: float, speeds: tuple[float, float], rng: np.random.Generator) -> IDMVehicle:
     lanes = road.network.all_side_lanes(("0", "1", 0))
-    vehicle = IDMVehicle.make_on_lane(road, lanes[rng.integers(len(lanes))], x, rng.uniform(*SPEED_RANGE))
+    vehicle = IDMVehicle.make_on_lane(road, lanes[rng.integers(len(lanes))], x, rng.uniform(*speeds))
     vehicle.DELTA = rng.uniform(*IDMVehicle.DELTA_RANGE)
     return vehicle
 
@@ -79,7 +81,8 @@ def _has_room(vehicle: IDMVehicle) -> bool:
     Who is changing into the lane counts as being there: MOBIL does not look again after it has decided.
     """
     for other in vehicle.road.vehicles:
-        if vehicle.lane_index in (other.lane_index, getattr(other, "target_lane_index", None)):
+        changing_in = getattr(other, "target_lane_index", None) == vehicle.lane_index
+        if changing_in or vehicle.lane.on_lane(other.position, margin=1):
             pair = (vehicle, other) if vehicle.position[0] < other.position[0] else (other, vehicle)
             if pair[0].lane_distance_to(pair[1]) < max(vehicle.desired_gap(*pair), 2 * vehicle.LENGTH):
                 return False
