@@ -206,7 +206,11 @@ class HighwayVisionEnv(AbstractEnv):
         if unknown:
             raise ValueError(f"unknown reset options {sorted(unknown)}; the only one is 'weather'")
         self._choices = _weather_choices(options["weather"]) if options else self.weathers
-        return super().reset(seed=seed)  # type: ignore[no-any-return]
+        draws = self.action_space.np_random.bit_generator
+        before = draws.state
+        observation, info = super().reset(seed=seed)
+        draws.state = before  # AbstractEnv.reset draws an action nobody uses, from the stream of whoever explores
+        return observation, info
 
     def _reset(self) -> None:
         self._sensor_rng = np.random.default_rng(self.np_random.integers(2**63))
