@@ -66,7 +66,8 @@ class HighwayVisionEnv(AbstractEnv):
     :param modalities: any of "rgb", "event", "depth"
     :param image_size: height and width of the images [px]
     :param vehicles_count: other vehicles in the window of 440 m
-    :param traffic_speed: range of the speeds the others want to drive at [m/s]
+    :param traffic_speed: range of the speeds the others want to drive at [m/s]; by default as in highway-env, 70 to
+        80% of its limit of 30 m/s
     :param lanes_count: number of lanes
     :param max_episode_steps: control steps per episode, or None for no limit
     :param initial_speed: of the ego vehicle [m/s], in 0 to ``max_speed``
@@ -92,7 +93,7 @@ class HighwayVisionEnv(AbstractEnv):
         modalities: Sequence[str] = ("rgb", "event", "depth"),
         image_size: int = 84,
         vehicles_count: int = 20,
-        traffic_speed: tuple[float, float] = (12.0, 24.0),
+        traffic_speed: tuple[float, float] = (21.0, 24.0),
         lanes_count: int = 4,
         max_episode_steps: int | None = 500,
         initial_speed: float = 0.0,
