@@ -53,7 +53,7 @@ SETTINGS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "10_hz": ({"policy_frequency": 10, "max_episode_steps": 1000}, {}),
     "start_20": ({"initial_speed": 20.0}, {}),
     "free_brake": ({"brake_cost": 0.0}, {}),
-    "even_traffic": ({"traffic_speed": (21.0, 24.0)}, {}),
+    "wide_traffic": ({"traffic_speed": (12.0, 24.0)}, {}),
     "no_costs": ({"brake_cost": 0.0, "steer_cost": 0.0}, {}),
 }
 

@@ -359,7 +359,7 @@ def test_road_equals_the_stock_road_bit_for_bit(seed: int) -> None:
     fast.reset(seed=seed)
     stock.reset(seed=seed)
     rng = np.random.default_rng(seed)
-    for _ in range(300):
+    for _ in range(150):
         action = np.array([rng.uniform(-0.5, 1.0), rng.uniform(-0.3, 0.3)])
         one, other = fast.step(action), stock.step(action)
         assert np.array_equal(fast._snapshot(), stock._snapshot())
