@@ -185,7 +185,7 @@ class MultiModalEncoder(nn.Module):
         if not is_image:
             return observation.to(dtype).flatten(start_dim=1)
         # channels last while still in bytes, arithmetic in float32, then bfloat16: the fastest order on a CPU
-        values = observation.contiguous(memory_format=th.channels_last).float()
+        values = observation.contiguous(memory_format=th.channels_last).to(th.float32, copy=True)
         if not self.normalize_images:
             pass
         elif key in self.signed_keys:

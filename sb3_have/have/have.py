@@ -196,7 +196,7 @@ class HAVESAC(SAC):
                 next_actions, next_log_prob = self.actor.action_log_prob(next_features.flatten(start_dim=1))
                 entropy_bonus = -ent_coef * next_log_prob
                 rewards, not_done = replay_data.rewards.squeeze(1), 1 - replay_data.dones.squeeze(1)
-                discounts = discounts * not_done if isinstance(discounts, float) else discounts.squeeze(1) * not_done
+                discounts = (discounts.squeeze(1) if isinstance(discounts, th.Tensor) else discounts) * not_done
                 target_q = self._target_values(next_features, next_actions, rewards, discounts, entropy_bonus)
             values = self.critic.values(inputs, replay_data.actions)
             critic_loss = self._critic_loss(values, target_q)
