@@ -331,7 +331,9 @@ class HAVESAC(SAC):
         infos: list[dict[str, Any]],
     ) -> None:
         """Refuses NaN before it reaches the replay buffer, where it would spoil the networks unseen."""
-        check_observation(new_obs, self.observation_space)
+        last_observations = [info.get("terminal_observation") for info in infos]  # new_obs has the next episode's first
+        for observation in [new_obs, *(last for last in last_observations if last is not None)]:
+            check_observation(observation, self.observation_space)
         if not np.isfinite(reward).all():
             raise ValueError(
                 f"reward: got {reward} at step {self.num_timesteps}, expected finite numbers; mend the environment's "

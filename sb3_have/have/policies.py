@@ -186,7 +186,8 @@ def check_observation(observation: np.ndarray | dict[str, np.ndarray], space: sp
     """
     :param observation: one observation or a batch of them
     :param space: the space that they belong to
-    :raises ValueError: if a key is missing or unknown, or a value is not finite; the message names the key
+    :raises ValueError: if a key is missing or unknown, or a value has another shape, is a float image where bytes are
+        expected, or is not finite; the message names the key
     """
     if isinstance(space, spaces.Dict):
         if not isinstance(observation, dict):
@@ -206,11 +207,32 @@ def check_observation(observation: np.ndarray | dict[str, np.ndarray], space: sp
         raise ValueError(f"Expected an array of shape {space.shape}, got a dict with the keys {list(observation)}.")
     items = observation.items() if isinstance(observation, dict) else [("observation", observation)]
     for key, value in items:
-        if np.issubdtype(np.asarray(value).dtype, np.floating) and not np.isfinite(value).all():
-            raise ValueError(
-                f"observation key {key!r}: {np.count_nonzero(~np.isfinite(value))} of {np.size(value)} values are NaN "
-                "or infinite; mend the environment (SB3's VecCheckNan shows where they come from)."
-            )
+        _check_value(key, np.asarray(value), space[key] if isinstance(space, spaces.Dict) else space)
+
+
+def _check_value(key: str, value: np.ndarray, space: spaces.Space[Any]) -> None:
+    assert space.shape is not None
+    shapes = [space.shape]
+    is_image = len(space.shape) == 3 and space.dtype == np.uint8
+    if is_image:  # SB3 transposes it, from what the environment returns to what the policy reads
+        shapes.append((*space.shape[1:], space.shape[0]))
+    if value.shape not in shapes and value.shape[1:] not in shapes:
+        raise ValueError(
+            f"observation key {key!r}: expected the shape {' or '.join(map(str, shapes))}, or a batch of it, got "
+            f"{value.shape}; give it as the training environment did (stacked, if by VecFrameStack, and of that size)."
+        )
+    if not np.issubdtype(value.dtype, np.floating):
+        return
+    if is_image:
+        raise ValueError(
+            f"observation key {key!r}: expected a uint8 image in 0..255, got {value.dtype}; convert it to uint8, or "
+            "train on float images with `policy_kwargs=dict(normalize_images=False)`."
+        )
+    if not np.isfinite(value).all():
+        raise ValueError(
+            f"observation key {key!r}: {np.count_nonzero(~np.isfinite(value))} of {np.size(value)} values are NaN "
+            "or infinite; mend the environment (SB3's VecCheckNan shows where they come from)."
+        )
 
 
 MultiInputPolicy = MultiModalPolicy
