@@ -215,37 +215,45 @@ class Run:
         self.out.mkdir(parents=True, exist_ok=True)
         checkpoint = newest_checkpoint(self.out)
         done = 0 if checkpoint is None else checkpoint_step(checkpoint)
+        if checkpoint is not None:
+            self._check_same_run(checkpoint)
         self._forget_after(done)
         env = make_training_env(self.env_id, self.config, self.out)
-        algorithm = algorithms()[self.algo]
-        if checkpoint is None:
-            model = algorithm(env=env, seed=self.seed, device=self.device, **model_kwargs(self.config))
-        else:
-            model = self._load(algorithm, checkpoint, env)
-        model.set_logger(configure(str(self.out / f"log-{done}"), ["csv"]))
-        callback = RunCallback(self)
         try:
+            model = self._make_model(checkpoint, env)
             if done < steps:
-                model.learn(
-                    steps - done, callback=callback, reset_num_timesteps=checkpoint is None, progress_bar=progress_bar
-                )
-        except KeyboardInterrupt:
-            callback.stopping = True
+                self._learn(model, steps - done, progress_bar)
         finally:
-            callback.restore_handlers()
             env.close()
-        self.interrupted = callback.stopping
         if keep_checkpoint and model.num_timesteps > done:
             self.save(model)
         _write_atomically(self.out / "model.zip", model.save)
         return model
 
-    def _load(self, algorithm: type[OffPolicyAlgorithm], checkpoint: Path, env: VecEnv) -> OffPolicyAlgorithm:
+    def _learn(self, model: OffPolicyAlgorithm, steps: int, progress_bar: bool) -> None:
+        done = model.num_timesteps
+        callback, logger = RunCallback(self), configure(str(self.out / f"log-{done}"), ["csv"])
+        model.set_logger(logger)
+        try:
+            model.learn(steps, callback=callback, reset_num_timesteps=done == 0, progress_bar=progress_bar)
+        except KeyboardInterrupt:  # the second one: the first ends the training by itself
+            callback.stopping = True
+        finally:
+            callback.restore_handlers()
+            logger.close()
+        self.interrupted = callback.stopping
+
+    def _check_same_run(self, checkpoint: Path) -> None:
         state = json.loads((checkpoint / "state.json").read_text())
         now = self._settings()
         if state["settings"] != now:
             raise ValueError(f"{checkpoint} is of a run with {state['settings']}, not {now}; choose another folder")
         self.seconds = state["seconds"]
+
+    def _make_model(self, checkpoint: Path | None, env: VecEnv) -> OffPolicyAlgorithm:
+        algorithm = algorithms()[self.algo]
+        if checkpoint is None:
+            return algorithm(env=env, seed=self.seed, device=self.device, **model_kwargs(self.config))
         model = algorithm.load(checkpoint / "model.zip", env=env, device=self.device)
         model.load_replay_buffer(checkpoint / "replay_buffer.pkl")
         # other episodes and noise than those at the start of the run

@@ -17,6 +17,8 @@ class FakeDrive(gym.Env[Any, np.ndarray]):
     :param image_size: [px]
     """
 
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012
+
     def __init__(self, weather: str = "slow", image_size: int = 36, render_mode: str | None = None) -> None:
         self.metres = 1.0 if weather == "slow" else 2.0
         self.weather, self.image_size, self.render_mode = weather, image_size, render_mode

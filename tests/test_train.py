@@ -1,0 +1,141 @@
+"""Training runs: resumed where they were, evaluations neither lost nor doubled, stopped in good order."""
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import pytest
+import torch as th
+from fake_drive import ENV_ID
+
+import sb3_have
+from sb3_have import train
+from sb3_have.train import Run, config_path, load_config, model_kwargs, newest_checkpoint
+
+CONFIG: dict[str, Any] = {
+    "n_timesteps": 100,
+    "frame_stack": 2,
+    "env_kwargs": {"weather": "fast"},
+    "policy": "MultiInputPolicy",
+    "buffer_size": 50,
+    "batch_size": 4,
+    "learning_starts": 5,
+    "policy_kwargs": {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 8}},
+}
+
+
+def make_run(out: Path, **kwargs: Any) -> Run:
+    options = {"algo": "sac", "eval_freq": 10, "eval_episodes": 1, "weathers": ("slow", "fast"), "save_freq": 0}
+    return Run(CONFIG, ENV_ID, out, **{**options, "device": "cpu", **kwargs})
+
+
+def test_resumed_run_goes_on(tmp_path: Path) -> None:
+    first = make_run(tmp_path).train(25)
+    second_run = make_run(tmp_path)
+    second = second_run.train(40)
+    assert (first.num_timesteps, second.num_timesteps) == (25, 40)
+    assert first.replay_buffer is not None and second.replay_buffer is not None
+    assert second.replay_buffer.pos == 40
+    assert (second.replay_buffer.actions[:25] == first.replay_buffer.actions[:25]).all()
+    assert second._n_updates > first._n_updates > 0
+    frame = pd.read_csv(tmp_path / "evaluation.csv")
+    assert list(frame["step"]) == [10, 10, 20, 20, 30, 30, 40, 40]
+    assert list(frame["weather"]) == ["slow", "fast"] * 4
+    assert frame["wall_time"].is_monotonic_increasing
+    assert [path.name for path in tmp_path.glob("checkpoint*")] == ["checkpoint-40"]
+    assert second_run.seconds > 0
+
+
+def test_finished_run_is_not_touched(tmp_path: Path) -> None:
+    before = make_run(tmp_path).train(12).policy.state_dict()
+    after = make_run(tmp_path).train(12).policy.state_dict()
+    assert all(th.equal(before[key], after[key]) for key in before)
+    assert len(pd.read_csv(tmp_path / "evaluation.csv")) == 2
+
+
+def test_records_after_the_checkpoint_are_dropped(tmp_path: Path) -> None:
+    """As when a run is killed between two checkpoints."""
+    make_run(tmp_path, save_freq=20).train(35, keep_checkpoint=False)
+    assert newest_checkpoint(tmp_path) == tmp_path / "checkpoint-20"
+    make_run(tmp_path).train(40)
+    assert list(pd.read_csv(tmp_path / "evaluation.csv")["step"]) == [10, 10, 20, 20, 30, 30, 40, 40]
+    assert pd.read_csv(tmp_path / "monitor.csv", skiprows=1)["l"].sum() <= 40
+
+
+def test_folder_of_another_run_is_refused(tmp_path: Path) -> None:
+    make_run(tmp_path, eval_freq=0).train(8)
+    with pytest.raises(ValueError, match="choose another folder"):
+        make_run(tmp_path, seed=1).train(12)
+
+
+def test_incomplete_checkpoint_is_ignored(tmp_path: Path) -> None:
+    (tmp_path / "checkpoint.partial").mkdir()
+    assert newest_checkpoint(tmp_path) is None
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_signal_ends_training_and_saves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
+) -> None:
+    """The step in which the signal comes is finished; the handlers are given back."""
+
+    class Interrupted(train.RunCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 15:
+                os.kill(os.getpid(), number)
+            return super()._on_step()
+
+    monkeypatch.setattr(train, "RunCallback", Interrupted)
+    before = signal.getsignal(number)
+    run = make_run(tmp_path, eval_freq=0)
+    assert run.train(1000).num_timesteps == 15
+    assert run.interrupted and newest_checkpoint(tmp_path) == tmp_path / "checkpoint-15"
+    assert (tmp_path / "model.zip").is_file()
+    assert signal.getsignal(number) == before
+
+
+def test_interrupt_during_an_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train, "evaluate", lambda *args, **kwargs: os.kill(os.getpid(), signal.SIGINT))
+    run = make_run(tmp_path)
+    assert run.train(1000).num_timesteps == 10
+    assert run.interrupted and not (tmp_path / "evaluation.csv").exists()
+
+
+def test_time_limit(tmp_path: Path) -> None:
+    run = make_run(tmp_path, eval_freq=0, time_limit=0.0)
+    assert run.train(1000).num_timesteps == 1
+    assert not run.interrupted
+
+
+def test_constructor_gets_a_copy_of_what_concerns_it() -> None:
+    kwargs = model_kwargs({**CONFIG, "n_envs": 2})
+    assert set(CONFIG) - set(kwargs) == {"n_timesteps", "frame_stack", "env_kwargs"} and "n_envs" not in kwargs
+    kwargs["policy_kwargs"]["net_arch"].append(1)
+    assert CONFIG["policy_kwargs"]["net_arch"] == [8]
+
+
+def test_several_environments(tmp_path: Path) -> None:
+    run = Run({**CONFIG, "n_envs": 2}, ENV_ID, tmp_path, algo="sac", eval_freq=15, eval_episodes=1, weathers=["slow"])
+    assert run.train(30).num_timesteps == 30
+    # a step counts two, so 15 is passed at 16
+    assert list(pd.read_csv(tmp_path / "evaluation.csv")["step"]) == [16, 30]
+    assert len(list(tmp_path.glob("*.monitor.csv"))) == 2
+
+
+def test_shipped_configuration_fits_havesac() -> None:
+    config = load_config("havesac", "HighwayVision-v0")
+    env = train.make_training_env("HighwayVision-v0", config)
+    model = sb3_have.HAVESAC(env=env, **{**model_kwargs(config), "buffer_size": 2})
+    assert model.gamma == config["gamma"] == 0.98
+    shapes = {key: space.shape for key, space in model.observation_space.spaces.items()}  # type: ignore[attr-defined]
+    assert shapes == {"rgb": (9, 64, 64), "event": (15, 64, 64), "depth": (3, 64, 64)}
+    env.close()
+
+
+def test_unknown_configuration_is_explained() -> None:
+    with pytest.raises(FileNotFoundError, match=r"nothing.*zoo_configs"):
+        config_path("nothing")
+    with pytest.raises(KeyError, match=r"Pendulum-v1.*only for HighwayVision-v0"):
+        load_config("havesac", "Pendulum-v1")
