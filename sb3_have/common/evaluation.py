@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
+import zlib
 from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Protocol
@@ -53,8 +54,8 @@ def evaluate(
     :param env_id: of a registered environment that takes the keyword ``weather``
     :param weathers: names of the weathers
     :param n_episodes: episodes in each weather
-    :param seed: of the episodes; the same seed gives every driver the same episodes, and in every weather the same
-        traffic, whatever ``n_envs`` is
+    :param seed: of the episodes; the same seed gives every driver the same episodes, whatever
+        ``n_envs`` is
     :param env_kwargs: further keywords for ``gym.make``, the same as in training
     :param n_envs: environments at a time, each in a process of its own when there are several
     :param deterministic: whether the policy's mode is driven rather than a sample of it
@@ -87,9 +88,10 @@ def evaluate_episodes(
     """
     if n_episodes < 1 or n_envs < 1 or not weathers:
         raise ValueError(f"need n_episodes, n_envs >= 1 and a weather, got {n_episodes}, {n_envs}, {list(weathers)}")
-    seeds = np.random.SeedSequence(seed).generate_state(n_episodes)
+    # Every weather has traffic of its own, the same for every driver: more situations for the same number of episodes.
+    seeds = {w: np.random.SeedSequence([seed, zlib.crc32(w.encode())]).generate_state(n_episodes) for w in weathers}
     # Weathers vary fastest, so that the shares of the environments are alike.
-    tasks = [Task(weather, int(s)) for s in seeds for weather in weathers]
+    tasks = [Task(weather, int(seeds[weather][i])) for i in range(n_episodes) for weather in weathers]
     n_envs = min(n_envs, len(tasks))
     # A fixed share for each environment: taking whatever ends first would favour short episodes.
     shares = [tasks[i::n_envs] for i in range(n_envs)]
