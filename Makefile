@@ -7,7 +7,7 @@ SOURCES = sb3_have tests benchmarks
 # One torch thread a process: the two test processes would otherwise fight over the cores.
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
-.PHONY: demo test lint format check-codestyle type commit-checks install clean
+.PHONY: demo test lint format type commit-checks install clean
 
 demo: $(INSTALLED)
 	$(BIN)/python -m sb3_have.demo

@@ -151,7 +151,9 @@ class MultiModalEncoder(nn.Module):
         if signed_keys is None:
             signed_keys = [key for key in keys if "event" in key]
         else:
-            _check_known("signed_keys", signed_keys, keys)
+            _check_known(
+                "signed_keys", signed_keys, [key for key in keys if len(observation_space[key].shape or ()) == 3]
+            )
         self.features_dim = features_dim
         self.signed_keys = frozenset(signed_keys)
         self.normalize_images = normalize_images
@@ -168,13 +170,19 @@ class MultiModalEncoder(nn.Module):
         if not isinstance(observations, dict):
             observations = {"observation": observations}
         features = []
-        for encoder, modality in zip(self.encoders, self.modalities.values(), strict=True):
+        for encoder, (name, modality) in zip(self.encoders, self.modalities.items(), strict=True):
             observation = observations[modality.keys[0]]
             dtype = self._image_dtype(observation.device) if modality.is_image else th.float32
             decoded = [self._decode(key, observations[key], modality.is_image, dtype) for key in modality.keys]
             inputs = decoded[0] if len(decoded) == 1 else th.cat(decoded, dim=1)
             with th.autocast(observation.device.type, dtype=dtype, enabled=dtype != th.float32):
-                features.append(encoder(inputs).float())
+                encoded = encoder(inputs)
+            if encoded.shape != (len(inputs), self.features_dim):
+                raise ValueError(
+                    f"modality {name!r}: {type(encoder).__name__} gave features of shape {tuple(encoded.shape)}, "
+                    f"expected {(len(inputs), self.features_dim)}; let it end in the `features_dim` units it is given."
+                )
+            features.append(encoded.float())
         return th.stack(features, dim=1)
 
     def _image_dtype(self, device: th.device) -> th.dtype:
@@ -235,12 +243,18 @@ def _check_box(key: str, space: spaces.Space[Any], normalize_images: bool) -> sp
             f"{where}: expected a Box (an image or a vector), got {space}; encode it as numbers, e.g. "
             "by a wrapper that flattens or one-hot encodes this key (gymnasium.spaces.utils.flatten)."
         )
+    if len(space.shape) == 2 and space.dtype == np.uint8:
+        raise ValueError(
+            f"{where}: expected an image (H, W, C) or a vector, got {space.dtype} of shape {space.shape}; give a grey "
+            "image a channel axis (gymnasium.wrappers.ReshapeObservation, or image[..., None])."
+        )
     if len(space.shape) != 3:
         return space
     if normalize_images and not is_image_space(space):
         raise ValueError(
             f"{where}: expected a uint8 image with bounds 0..255, got {space.dtype} of shape {space.shape} in "
-            f"[{space.low.min()}, {space.high.max()}]; convert it to uint8, or pass "
+            f"[{space.low.min()}, {space.high.max()}]; convert it to uint8 (under "
+            "VecNormalize, leave it out of `norm_obs_keys`), or pass "
             "`policy_kwargs=dict(normalize_images=False)` to feed channel-first images as they are."
         )
     if not is_image_space_channels_first(space):

@@ -48,7 +48,7 @@ class AuxiliaryLoss(nn.Module, ABC):
 
     @abstractmethod
     def forward(self, batch: LatentTransitions) -> dict[str, th.Tensor]:
-        """One scalar loss per term, unweighted."""
+        """One scalar loss for each of ``terms``, unweighted."""
 
 
 class AuxiliaryLossCallback(BaseCallback):
@@ -93,6 +93,8 @@ class AuxiliaryLossCallback(BaseCallback):
         return True
 
     def _set_coefficients(self) -> None:
-        factor = 1.0 if self.schedule is None else self.schedule(self.model._current_progress_remaining)
+        # not the model's own `_current_progress_remaining`, which is the last run's until the first update
+        progress_remaining = 1 - self.model.num_timesteps / self.model._total_timesteps
+        factor = 1.0 if self.schedule is None else self.schedule(progress_remaining)
         for term, coefficient in self.coefficients.items():
             self.model.auxiliary_coefs[term] = factor * coefficient

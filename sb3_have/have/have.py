@@ -17,7 +17,7 @@ from stable_baselines3.common.utils import polyak_update
 
 from sb3_have.have.auxiliary import AuxiliaryLoss, LatentTransitions
 from sb3_have.have.critic import MultiModalCritic, Values
-from sb3_have.have.policies import MultiModalPolicy, check_observation
+from sb3_have.have.policies import MultiModalPolicy, check_observation, check_stored_observation
 
 SelfHAVESAC = TypeVar("SelfHAVESAC", bound="HAVESAC")
 TARGETS = ("bellman", "paper")
@@ -34,6 +34,9 @@ class HAVESAC(SAC):
 
     :param policy: "MultiInputPolicy" or a subclass of :class:`MultiModalPolicy`
     :param env: environment with Box actions and Dict (or Box) observations
+    :param target_update_interval: updates between two target updates, counted over the whole training (SB3 counts them
+        anew in every call of ``train``, so that there it does nothing with ``gradient_steps=1``)
+    :param n_steps: as in SB3, so not for Dict observations; DeepMDP then predicts n steps ahead from one action
     :param value_estimation: which value acts: "have" (re-fusion of both), "lve" (weighted local values alone) or "gve"
         (global value alone), the paper's ablations
     :param refusion: form of the re-fusion network: "convex", "monotone" or "free" (the paper's), see
@@ -95,19 +98,15 @@ class HAVESAC(SAC):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        if target not in TARGETS:
-            raise ValueError(f"target={target!r}: expected one of {TARGETS}.")
-        if local_coef < 0:
-            raise ValueError(f"local_coef={local_coef}: expected a number >= 0.")
-        if not 0 <= modality_dropout < 1:
-            raise ValueError(f"modality_dropout={modality_dropout}: expected a probability in [0, 1).")
+        policy_kwargs = dict(policy_kwargs or {})
+        for name, value, default in [("value_estimation", value_estimation, "have"), ("refusion", refusion, "convex")]:
+            if policy_kwargs.setdefault(name, value) != value and value != default:
+                raise ValueError(f"{name}={value!r}, but policy_kwargs has {policy_kwargs[name]!r}: give it once.")
         losses = _auxiliary_classes(auxiliary)
-        policy_kwargs = {"value_estimation": value_estimation, "refusion": refusion, **(policy_kwargs or {})}
-        own_losses = {
-            name: loss for name, loss in losses.items() if name not in MultiModalPolicy.default_auxiliary_losses
-        }
+        defaults = MultiModalPolicy.default_auxiliary_losses
+        own_losses = {name: loss for name, loss in losses.items() if defaults.get(name) is not loss}
         if own_losses:
-            policy_kwargs["auxiliary_losses"] = own_losses
+            policy_kwargs["auxiliary_losses"] = {**policy_kwargs.get("auxiliary_losses", {}), **own_losses}
         if env is not None:
             env = maybe_make_env(env, verbose)
             if not isinstance(env.action_space, spaces.Box):
@@ -152,13 +151,23 @@ class HAVESAC(SAC):
         if _init_setup_model:
             self._setup_model()
 
+    def _setup_model(self) -> None:
+        # Here and not in the constructor, because `load` sets attributes in between
+        if self.target not in TARGETS:
+            raise ValueError(f"target={self.target!r}: expected one of {TARGETS}.")
+        if self.local_coef < 0:
+            raise ValueError(f"local_coef={self.local_coef}: expected a number >= 0.")
+        if not 0 <= self.modality_dropout < 1:
+            raise ValueError(f"modality_dropout={self.modality_dropout}: expected a probability in [0, 1).")
+        super()._setup_model()
+
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         self.policy.set_training_mode(True)
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         if self.ent_coef_optimizer is not None:
             optimizers += [self.ent_coef_optimizer]
         self._update_learning_rate(optimizers)
-        actor_parameters = list(self.actor.parameters())
+        actor_parameters = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
         critic_parameters: list[th.Tensor] = list(self.critic.parameters())
         target_parameters: list[th.Tensor] = list(self.critic_target.parameters())
         assert isinstance(self.target_entropy, float)  # for the type checker
@@ -216,7 +225,7 @@ class HAVESAC(SAC):
             min_q_pi = self.critic.values(actor_inputs, actions_pi).q.min(dim=0).values
             actor_loss = (ent_coef * log_prob - min_q_pi).mean()
             logs.setdefault("actor_loss", []).append(actor_loss.detach())
-            gradients = th.autograd.grad(actor_loss, actor_parameters)
+            gradients = th.autograd.grad(actor_loss, actor_parameters, allow_unused=True)
             for parameter, gradient in zip(actor_parameters, gradients, strict=True):
                 parameter.grad = gradient
             self.actor.optimizer.step()
@@ -281,7 +290,14 @@ class HAVESAC(SAC):
         terms: dict[str, th.Tensor] = {}
         for loss in self.policy.auxiliary.values():
             if any(term in self.auxiliary_coefs for term in loss.terms):  # type: ignore[union-attr]
-                terms.update(loss(batch))
+                losses: dict[str, th.Tensor] = loss(batch)
+                announced = set(loss.terms)  # type: ignore[arg-type]
+                if losses.keys() != announced:
+                    raise ValueError(
+                        f"{type(loss).__name__}: forward returned the losses {sorted(losses)}, but `terms` announces "
+                        f"{sorted(announced)}; make them the same."
+                    )
+                terms.update(losses)
         return {term: value for term, value in terms.items() if term in self.auxiliary_coefs}
 
     def _drop_modalities(self, features: th.Tensor) -> th.Tensor:
@@ -319,6 +335,9 @@ class HAVESAC(SAC):
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         assert self._last_obs is not None
         check_observation(self._last_obs, self.observation_space)
+        if self._vec_normalize_env is not None:
+            assert self._last_original_obs is not None
+            check_stored_observation(self._last_original_obs, self.observation_space)
         return result
 
     def _store_transition(
@@ -371,4 +390,8 @@ def _auxiliary_classes(auxiliary: str | Mapping[str, type[AuxiliaryLoss]] | None
                 f"auxiliary={auxiliary!r}: expected one of {list(known)}, None, or {{name: AuxiliaryLoss class}}."
             )
         return {auxiliary: known[auxiliary]}
-    return dict(auxiliary)
+    classes = dict(auxiliary) if isinstance(auxiliary, Mapping) else {"": auxiliary}
+    for name, loss in classes.items():
+        if not (name and isinstance(loss, type) and issubclass(loss, AuxiliaryLoss)):
+            raise ValueError(f"auxiliary={auxiliary!r}: expected 'deepmdp', None, or {{name: AuxiliaryLoss class}}.")
+    return classes

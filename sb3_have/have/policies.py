@@ -121,6 +121,13 @@ class MultiModalPolicy(SACPolicy):
         encoder = self.critic.encoder
         sizes = (len(encoder.modalities), encoder.features_dim, get_action_dim(self.action_space))
         losses = {**self.default_auxiliary_losses, **self.auxiliary_losses}
+        terms = [term for loss_class in losses.values() for term in loss_class.terms]
+        doubled = {term for term in terms if terms.count(term) > 1}
+        if doubled:
+            raise ValueError(
+                f"auxiliary losses {list(losses)}: more than one has the terms {sorted(doubled)}; rename them, or take "
+                "DeepMDP's place by the name 'deepmdp'."
+            )
         self.auxiliary = nn.ModuleDict({name: loss_class(*sizes) for name, loss_class in losses.items()})
 
         self.actor = self.make_actor()
@@ -129,10 +136,9 @@ class MultiModalPolicy(SACPolicy):
         self.critic.optimizer = self._make_optimizer(critic_parameters, lr_schedule)
 
     def _make_optimizer(self, parameters: list[nn.Parameter], lr_schedule: Schedule) -> th.optim.Optimizer:
-        kwargs: dict[str, Any] = (
-            {"fused": True} if self.optimizer_class is th.optim.Adam else {}
-        )  # one kernel for all parameters
-        kwargs.update(self.optimizer_kwargs)
+        kwargs = dict(self.optimizer_kwargs)
+        if self.optimizer_class is th.optim.Adam and not {"foreach", "differentiable"} & kwargs.keys():
+            kwargs.setdefault("fused", True)  # one kernel for all parameters
         return self.optimizer_class(parameters, lr=lr_schedule(1), **kwargs)  # type: ignore[call-arg]
 
     def make_critic(self, features_extractor: BaseFeaturesExtractor | None = None) -> MultiModalCritic:  # type: ignore[override]
@@ -208,6 +214,24 @@ def check_observation(observation: np.ndarray | dict[str, np.ndarray], space: sp
     items = observation.items() if isinstance(observation, dict) else [("observation", observation)]
     for key, value in items:
         _check_value(key, np.asarray(value), space[key] if isinstance(space, spaces.Dict) else space)
+
+
+def check_stored_observation(observation: np.ndarray | dict[str, np.ndarray], space: spaces.Space[Any]) -> None:
+    """
+    Under VecNormalize, SB3 stores what VecNormalize itself got, which must have its final shape already.
+
+    :param observation: a batch, as it will be stored
+    :param space: the policy's observation space
+    :raises ValueError: if VecNormalize is not the outermost wrapper that changes shapes
+    """
+    items = observation.items() if isinstance(observation, dict) else [("observation", observation)]
+    for key, value in items:
+        expected = (space[key] if isinstance(space, spaces.Dict) else space).shape
+        if value.shape[1:] != expected:
+            raise ValueError(
+                f"observation key {key!r}: VecNormalize gets the shape {value.shape[1:]}, the policy reads {expected}; "
+                "wrap in the order VecNormalize(VecTransposeImage(VecFrameStack(env, n)), norm_obs_keys=[...])."
+            )
 
 
 def _check_value(key: str, value: np.ndarray, space: spaces.Space[Any]) -> None:
