@@ -178,3 +178,46 @@ def test_two_losses_of_one_name_are_refused() -> None:
 
     with pytest.raises(ValueError, match="reward"):
         model_with({"own": OwnReward})
+
+
+class OwnDeepMDP(DeepMDP):
+    """Takes DeepMDP's place."""
+
+
+def test_an_own_class_in_the_place_of_deepmdp() -> None:
+    model = model_with({"deepmdp": OwnDeepMDP})
+    assert type(model.policy.auxiliary["deepmdp"]) is OwnDeepMDP
+    model.train(1, batch_size=8)
+    assert logged_terms(model) == DEEPMDP_TERMS
+
+
+def test_losses_must_be_those_announced() -> None:
+    class Silent(InverseDynamics):
+        terms: ClassVar[tuple[str, ...]] = ("inverse", "samples", "silence")
+
+    model = model_with({"silent": Silent})
+    with pytest.raises(ValueError, match="silence"):
+        model.train(1, batch_size=8)
+
+
+@pytest.mark.parametrize("auxiliary", [{"x": 3}, DeepMDP, {"": DeepMDP}])
+def test_what_is_no_auxiliary_loss(auxiliary: Any) -> None:
+    with pytest.raises(ValueError, match="AuxiliaryLoss class"):
+        model_with(auxiliary)
+
+
+def test_a_schedule_begins_anew_with_every_run() -> None:
+    model = tiny_model(vectors_space())
+    callback = DeepMDPCallback(schedule=lambda progress_remaining: progress_remaining)
+    model.learn(20, callback)
+    assert model.auxiliary_coefs["reward"] == 0.0
+    seen: list[float] = []
+
+    class Watch(DeepMDPCallback):
+        def _on_step(self) -> bool:
+            super()._on_step()
+            seen.append(self.model.auxiliary_coefs["reward"])
+            return True
+
+    model.learn(20, Watch(schedule=lambda progress_remaining: progress_remaining))
+    np.testing.assert_allclose(seen, 1 - np.arange(1, 21) / 20)

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 import torch as th
 from envs import RandomSensors, image, sensors_space, tiny_model, vector, vectors_space
 from gymnasium import spaces
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 
 from sb3_have import HAVESAC
 
@@ -251,3 +252,34 @@ def test_a_dict_for_a_box() -> None:
 def test_weights_of_a_model_without_any() -> None:
     model = tiny_model(vectors_space(), value_estimation="gve")
     refused(lambda: model.modality_weights(good_observation(vectors_space())), "gve", "have", "lve")
+
+
+def test_grey_images_without_a_channel() -> None:
+    space = spaces.Dict({"grey": spaces.Box(0, 255, (36, 36), np.uint8)})
+    refused(lambda: tiny_model(space), "'grey'", "(36, 36)", "channel axis")
+
+
+def test_signed_keys_that_are_no_images() -> None:
+    refused(lambda: tiny_model(sensors_space(), {"signed_keys": ["state"]}), "signed_keys", "'state'")
+
+
+def test_one_option_in_two_places() -> None:
+    refused(lambda: tiny_model(vectors_space(), {"refusion": "monotone"}, refusion="free"), "refusion", "once")
+    assert tiny_model(vectors_space(), {"value_estimation": "gve"}).critic.value_estimation == "gve"
+
+
+def test_loading_with_a_wrong_option(tmp_path: Path) -> None:
+    tiny_model(vectors_space()).save(tmp_path / "model")
+    refused(lambda: HAVESAC.load(tmp_path / "model", target="Paper"), "target='Paper'", "bellman")
+
+
+@pytest.mark.parametrize("stacked", [False, True])
+def test_vec_normalize_inside_of_what_changes_shapes(stacked: bool) -> None:
+    env = VecNormalize(DummyVecEnv([lambda: RandomSensors(sensors_space())]), norm_obs_keys=["state"])
+    model = tiny_model(sensors_space(), env=VecFrameStack(env, 2) if stacked else env)
+    refused(lambda: model.learn(2), "VecNormalize", "VecTransposeImage")
+
+
+def test_vec_normalize_on_images() -> None:
+    env = VecNormalize(VecTransposeImage(DummyVecEnv([lambda: RandomSensors(sensors_space())])))
+    refused(lambda: tiny_model(sensors_space(), env=env), "norm_obs_keys")

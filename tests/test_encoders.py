@@ -228,3 +228,13 @@ def test_a_single_box_is_one_modality(space: spaces.Box) -> None:
     weights = model.modality_weights(observation)
     assert set(weights) == {"observation"} and weights["observation"] == pytest.approx([1.0])
     assert isinstance(model.learn(12), HAVESAC)
+
+
+@pytest.mark.parametrize(
+    "size,expected",
+    [(84, [(32, 8, 4), (64, 4, 2), (64, 3, 1)]), (128, [(32, 3, 2), (32, 3, 1), (32, 3, 1), (32, 3, 1)])],
+)
+def test_default_layers_by_size(size: int, expected: list[tuple[int, int, int]]) -> None:
+    """Nature DQN's for small images, the paper's from 112 pixels on."""
+    layers = [m for m in ImageEncoder(channel_first(3, size)).convolutions if isinstance(m, th.nn.Conv2d)]
+    assert [(layer.out_channels, layer.kernel_size[0], layer.stride[0]) for layer in layers] == expected

@@ -8,14 +8,24 @@ import numpy as np
 import pytest
 import torch as th
 from envs import RandomSensors, batched, fill_buffer, quiet_logger, sensors_space, tiny_model, vectors_space
+from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_have import HAVESAC, MultiModalPolicy
+
+
+class Normed(th.nn.Sequential):
+    """An encoder with running statistics."""
+
+    def __init__(self, space: spaces.Box, features_dim: int):
+        super().__init__(th.nn.Linear(space.shape[0], features_dim), th.nn.BatchNorm1d(features_dim))
+
 
 VARIANTS: list[dict[str, Any]] = [
     {},
     {"refusion": "monotone", "target": "paper", "ent_coef": 0.1},
     {"value_estimation": "lve", "auxiliary": None, "use_sde": True},
+    {"policy_kwargs": {"encoder_classes": {"state": Normed}}},
     {"value_estimation": "gve", "local_coef": 0.0, "modality_dropout": 0.3, "ent_coef": "auto_0.01"},
 ]
 

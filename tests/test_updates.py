@@ -1,5 +1,6 @@
 """Who learns from what: optimizers, gradients, target networks."""
 
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
@@ -191,3 +192,39 @@ def test_gradient_steps_and_learning_rate_schedule() -> None:
     assert model._n_updates == 4
     optimizers = [model.actor.optimizer, model.critic.optimizer, model.ent_coef_optimizer]
     assert [optimizer.param_groups[0]["lr"] for optimizer in optimizers if optimizer] == [0.25e-3] * 3
+
+
+def test_every_observation_is_encoded_once() -> None:
+    """The encoder is the cost of an update: obs once by the critic's, next_obs once by the target's."""
+    model = tiny_model(vectors_space())
+    fill_buffer(model, 20)
+    calls = {"critic": 0, "target": 0}
+
+    def count(name: str) -> Callable[..., None]:
+        def hook(*_: Any) -> None:
+            calls[name] += 1
+
+        return hook
+
+    model.critic.encoder.register_forward_hook(count("critic"))
+    model.critic_target.encoder.register_forward_hook(count("target"))
+    model.train(3, batch_size=8)
+    assert calls == {"critic": 3, "target": 3}
+
+
+def test_frozen_actor_parameters_stay() -> None:
+    model = tiny_model(vectors_space())
+    fill_buffer(model, 20)
+    model.actor.latent_pi.requires_grad_(False)
+    before = clone_parameters(model.actor)
+    model.train(2, batch_size=8)
+    assert changed(before, model.actor) == {"mu.weight", "mu.bias", "log_std.weight", "log_std.bias"}
+
+
+@pytest.mark.parametrize("options", [{"foreach": True}, {"fused": False}, {"weight_decay": 1e-4}])
+def test_options_of_adam(options: dict[str, Any]) -> None:
+    model = tiny_model(vectors_space(), {"optimizer_kwargs": options})
+    fill_buffer(model, 20)
+    model.train(1, batch_size=8)
+    group = model.critic.optimizer.param_groups[0]
+    assert all(group[name] == value for name, value in options.items())
