@@ -110,7 +110,7 @@ def plot_modality_weights(recording: Recording, columns: int = 8) -> Figure:
 def _finish_weights(axis: Axes, end: float) -> None:
     axis.set(xlabel="time [s]", ylabel="weight", ylim=(0, 1), xlim=(0, end))
     axis.grid(axis="y", alpha=0.3)
-    axis.legend(fontsize=8, ncols=4, loc="upper right")
+    axis.legend(fontsize=8, ncols=4, loc="lower right", bbox_to_anchor=(1, 1), borderaxespad=0.2, frameon=False)
 
 
 def _images(observation: Any) -> dict[str, np.ndarray]:
