@@ -28,8 +28,8 @@ from sb3_have.envs.weather import WEATHERS
 from sb3_have.train import Run, evaluation_env_kwargs, load_config
 
 ENV_ID = "HighwayVision-v0"
-STEPS = 8_000
-MINUTES = 9.5
+STEPS = 10_000
+MINUTES = 10.5
 """Training stops here on a slow machine, so that the whole demo stays within a quarter of an hour."""
 EPISODES = 2
 PROCESSES = 2
@@ -79,7 +79,8 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
     drivers: dict[str, Predictor] = {
         "HAVESAC": model,
         "random": RandomDriver(seed),
-        "keep straight": KeepStraightDriver(),
+        "straight at 25 m/s": KeepStraightDriver(25.0),
+        "straight at 20 m/s": KeepStraightDriver(20.0),
     }
     with phase(f"Evaluating {len(drivers)} drivers, {n_episodes} episodes in each of {len(WEATHERS)} weathers"):
         results = {
