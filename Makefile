@@ -33,7 +33,7 @@ install: $(INSTALLED)
 # The stamp is written last, so an interrupted installation is taken up again.
 $(INSTALLED): setup.cfg pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "Python >= 3.10 is needed, found " + sys.version.split()[0] + " (make PYTHON=python3.11 ...)")'
-	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	test -x $(BIN)/pip || $(PYTHON) -m venv --clear $(VENV)
 	$(BIN)/python -m pip install -c constraints.txt -e ".[dev]"
 	@touch $@
 

@@ -267,13 +267,15 @@ class Run:
 
     def _forget_after(self, step: int) -> None:
         """Drop what was recorded after the checkpoint that is resumed: it will be lived through again."""
-        path = self.out / "evaluation.csv"
-        if path.exists():
-            rows = pd.read_csv(path)
-            _write_atomically(path, partial(rows[rows["step"] <= step].to_csv, index=False))
-        for path in self.out.glob("*monitor.csv"):
-            if step == 0:
+        recorded = [*self.out.glob("*monitor.csv"), *self.out.glob("evaluation.csv")]
+        if step == 0:
+            for path in recorded:
                 path.unlink()
+            return
+        for path in recorded:
+            if path.name == "evaluation.csv":
+                rows = pd.read_csv(path)
+                _write_atomically(path, partial(rows[rows["step"] <= step].to_csv, index=False))
                 continue
             head, *lines = path.read_text().splitlines(keepends=True)
             rows = pd.read_csv(io.StringIO("".join(lines)))

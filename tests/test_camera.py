@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sb3_have.envs.camera import SUPERSAMPLING, Camera, Objects
-from sb3_have.envs.scene import ASPHALT, DASH_LENGTH, DASH_PERIOD, LINE_WIDTH, PAINTS, VEHICLE_HEIGHT
+from sb3_have.envs.camera import FAR, SUPERSAMPLING, Camera, Objects
+from sb3_have.envs.scene import ASPHALT, DASH_LENGTH, DASH_PERIOD, LINE_WIDTH, PAINTS, VEHICLE_HEIGHT, WORLD_PERIOD
 from sb3_have.envs.weather import LUMA
 
 Array = NDArray[Any]
@@ -138,16 +138,23 @@ def test_agrees_with_a_ray_caster(seed: int) -> None:
 
 
 def test_instants_in_one_pass_equal_one_at_a_time() -> None:
-    at = np.repeat(poses((0, 4, 0.01), (20, 4, 0), (35, 8, 0), (60, 0, 0)), 3, axis=0)
-    at[:, 0, 0] = 0, 1, 2
+    # The last car drives out of view; with the ego the tree and the joint of the rail that come next change.
+    at = np.repeat(poses((35, 4, 0.01), (60, 4, 0), (75, 8, 0), (100, 0, 0), (36 + FAR, 12, 0)), 3, axis=0)
+    at[:, 0, 0] = 35, 38, 41
+    at[:, 4, 0] += 0, 7, 14
     camera = road_camera(64)
-    together = camera.objects(at, sizes(4))
-    last = together.last(3, 64**2)
-    alone = camera.objects(at[2:], sizes(4))
-    visible = alone.vehicle[alone.face] >= 0  # the guard-rails begin where the first instant has them
-    np.testing.assert_array_equal(alone.pixel[visible], last.pixel[last.vehicle[last.face] >= 0])
-    np.testing.assert_array_equal(alone.depth[visible], last.depth[last.vehicle[last.face] >= 0])
-    np.testing.assert_array_equal(camera.ground(at).marking[2], camera.ground(at[2:]).marking[0])
+    together, ground = camera.objects(at, sizes(5)), camera.ground(at)
+    for k in range(3):
+        alone, last = camera.objects(at[k : k + 1], sizes(5)), camera.objects(at[: k + 1], sizes(5)).last(k + 1, 64**2)
+        here = together.pixel // 64**2 == k
+        for pixel, part in ((last.pixel, last), (together.pixel[here] - k * 64**2, together)):
+            rows = here if part is together else slice(None)
+            np.testing.assert_array_equal(alone.pixel, pixel)
+            np.testing.assert_array_equal(alone.depth, part.depth[rows])
+            np.testing.assert_array_equal(alone.material, part.material[rows])
+            np.testing.assert_array_equal(alone.vehicle[alone.face], part.vehicle[part.face[rows]])
+        for name in ("road", "marking", "verge"):
+            np.testing.assert_array_equal(getattr(ground, name)[k], getattr(camera.ground(at[k : k + 1]), name)[0])
 
 
 def test_markings_lie_where_the_lanes_end() -> None:
@@ -177,11 +184,29 @@ def test_lane_lines_are_dashed() -> None:
 
 def test_looks_the_same_far_down_the_road() -> None:
     camera = road_camera(64)
-    here, there = camera.ground(poses((3.0, 4, 0))), camera.ground(poses((3.0 + 240 * 50, 4, 0)))
+    here, there = camera.ground(poses((3.0, 4, 0))), camera.ground(poses((3.0 + WORLD_PERIOD * 12, 4, 0)))
     np.testing.assert_allclose(here.marking, there.marking, atol=1e-4)
     at = poses((3.0, 4, 0), (30, 4, 0))
-    far = at + np.array((240.0 * 50, 0, 0))
+    far = at + np.array((WORLD_PERIOD * 12, 0, 0))
     np.testing.assert_allclose(look(camera, at)[0], look(camera, far)[0], rtol=1e-5)
+
+
+@pytest.mark.parametrize("period", range(4))
+def test_the_verge_does_not_jump(period: int) -> None:
+    # A centimetre across each place where the old position could be taken modulo a period, the picture stays.
+    camera = road_camera(64)
+    for border in (240.0 * (period + 1), WORLD_PERIOD * (period + 1)):
+        before, after = (camera.ground(poses((border - 1 + side, 4, 0))).verge for side in (-0.005, 0.005))
+        assert (before == after).mean() > 0.9
+        assert before[:, -16:].std() > 0.1
+
+
+def test_the_verge_has_no_double_patch_at_zero() -> None:
+    camera = road_camera(65)
+    camera._patchwork = np.tile(np.arange(64, dtype=np.float32), (64, 1))  # the number of the patch across the road
+    # The middle column looks along the road: it sees the ground at the ego's own y.
+    patches = [camera.ground(poses((0, y, 0))).verge[0, -1, 32] for y in (-1.5, -0.5, 0.5, 1.5)]
+    np.testing.assert_array_equal(patches, [62, 63, 0, 1])
 
 
 def test_every_paint_stands_out_from_the_road_by_its_brightness() -> None:

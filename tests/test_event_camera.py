@@ -66,6 +66,15 @@ def test_nothing_moves_nothing_fires() -> None:
     assert len(run(camera, np.repeat(frame[None], 5, axis=0))) == 0
 
 
+@pytest.mark.parametrize("threshold, level", [(0.2, 1.2), (0.1, 0.6)])
+def test_a_level_at_rest_on_a_threshold_fires_no_more(threshold: float, level: float) -> None:
+    # The last of the crossings rounds to just beyond the level, and the reference that has moved to just below it.
+    camera = EventCamera(1, 1, threshold=threshold, mapping="identity")
+    camera.step([[0.0]], 0.0)
+    assert len(camera.step([[level]], 1.0)) == 5
+    assert [len(camera.step([[level]], t)) for t in (2.0, 3.0)] == [0, 0]
+
+
 @pytest.mark.parametrize("sigma", [0.0, 0.05])
 @pytest.mark.parametrize("threshold", [0.2, (0.15, 0.3)])
 def test_equals_a_loop_over_pixels(sigma: float, threshold: float | tuple[float, float]) -> None:
@@ -138,9 +147,22 @@ def test_refractory_period_thins_events() -> None:
 
 def test_leak_fires_at_its_rate() -> None:
     camera = EventCamera(2, 2, leak_rate=4.0, threshold_sigma=0.03, seed=0)
-    events = run(camera, np.ones((53, 2, 2)), 0.05)
-    assert len(events) == 4 * 10 and np.all(events["p"] == 1)
-    np.testing.assert_allclose(np.unique(events["t"].round(9)), 0.25 * np.arange(1, 11), atol=1e-9)
+    events = run(camera, np.ones((51, 2, 2)), 0.05)
+    assert np.all(events["p"] == 1)
+    for pixel in range(4):
+        times = events["t"][2 * events["y"] + events["x"] == pixel]
+        assert len(times) == 10 and times[0] < 0.25
+        np.testing.assert_allclose(np.diff(times), 0.25, atol=1e-9)
+
+
+def test_pixels_leak_at_phases_of_their_own() -> None:
+    camera = EventCamera(30, 30, leak_rate=4.0, threshold_sigma=0.03, seed=0)
+    events = run(camera, np.ones((51, 30, 30)), 0.05)
+    assert len(events) == pytest.approx(900 * 4.0 * 2.5, abs=900)
+    shares = np.histogram(events["t"] % 0.25, bins=5, range=(0, 0.25))[0] / len(events)
+    np.testing.assert_allclose(shares, 0.2, atol=5 * np.sqrt(0.2 * 0.8 / 900))
+    camera.reset()
+    np.testing.assert_array_equal(run(camera, np.ones((51, 30, 30)), 0.05), events)
 
 
 def test_shot_noise_has_its_rate_and_no_preference() -> None:

@@ -245,7 +245,8 @@ def match_observations(vec_env: VecEnv, model: Any) -> VecEnv:
     :param vec_env: the bare environment, images channel-last
     :param model: its ``observation_space`` decides: frames are stacked (``VecFrameStack``) and images transposed
         (``VecTransposeImage``) where that makes the spaces equal; without one, nothing is done
-    :raises ValueError: if they cannot be made equal, or the model saw observations through a ``VecNormalize``
+    :raises ValueError: if they cannot be made equal, or the model's environment normalises observations by a
+        ``VecNormalize`` (a model loaded without its environment does not tell)
     """
     wanted: spaces.Space[Any] | None = getattr(model, "observation_space", None)
     if wanted is None:

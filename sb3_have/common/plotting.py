@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -58,7 +59,7 @@ def plot_learning_curve(
         axis.plot(group["step"], group[column], ".", color="0.65", markersize=4, label="episode")
         running = group[column].rolling(window, min_periods=1).mean()
         axis.plot(group["step"], running, color="#0072B2", linewidth=2, label=f"mean of {window}")
-        for style, (reference, level) in zip(("--", ":", "-."), (references or {}).items(), strict=False):
+        for style, (reference, level) in zip(cycle(("--", ":", "-.")), (references or {}).items(), strict=False):
             axis.axhline(level, color="0.3", linestyle=style, linewidth=1, label=reference)
         if group.empty:
             axis.text(0.5, 0.5, "no episode ended yet", ha="center", transform=axis.transAxes)

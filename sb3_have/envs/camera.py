@@ -124,7 +124,7 @@ class Camera:
         beyond = np.abs(across - np.float32(self.roadside.middle)) - np.float32(self.roadside.half_width)
         road = np.clip(np.float32(0.5) - beyond / wide, 0, 1)
         # Patches of 1 m average out where they are smaller than a pixel.
-        patches = self._patchwork[along.astype(np.int32) & 63, across.astype(np.int32) & 63]
+        patches = self._patchwork[np.floor(along).astype(np.int32) & 63, np.floor(across).astype(np.int32) & 63]
         verge = 1 + (patches - 1) * np.minimum(1, 2 / np.maximum(wide, long))
         return Ground(road, marking, verge)
 
@@ -182,14 +182,14 @@ class Camera:
         in_view = (forward > -5) & (forward < FAR + 5) & (np.abs(right) < 0.6 * forward + 12)
         shown = np.flatnonzero(in_view.any(axis=0))
         order = shown[np.argsort(-np.hypot(forward[:, shown], right[:, shown]), axis=1, kind="stable")]
-        faces = Faces.concatenate(
-            self.roadside.faces(float(x[0]), len(poses), FAR), vehicle_faces(traffic, sizes[1:], order)
-        )
+        faces = Faces.concatenate(self.roadside.faces(x, FAR), vehicle_faces(traffic, sizes[1:], order))
 
         start, end = _to_camera(faces.start, x, y, heading), _to_camera(faces.end, x, y, heading)
         # Turned towards the camera: the start lies to the left of the end.
         seen = start[..., 0] * end[..., 1] > start[..., 1] * end[..., 0]
         seen &= np.maximum(start[..., 0], end[..., 0]) > 2 * NEAR
+        # A vehicle is shown at the instants at which it is in view; number -1, the roadside, at all.
+        seen &= np.take_along_axis(np.pad(in_view, ((0, 0), (0, 1)), constant_values=True), faces.vehicle, axis=1)
         instant = np.nonzero(seen)[0]
         start, end = start[seen], end[seen]
         faces = Faces(*(getattr(faces, field.name)[seen] for field in fields(Faces)))

@@ -117,7 +117,7 @@ class HighwayVisionEnv(AbstractEnv):
             ("policy_frequency", policy_frequency, 1),
             ("simulation_frequency", simulation_frequency, 1),
         ]:
-            if int(value) != value or value < least:
+            if not isinstance(value, int | np.integer) or value < least:
                 raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
         if simulation_frequency % policy_frequency:
             raise ValueError(
@@ -129,7 +129,7 @@ class HighwayVisionEnv(AbstractEnv):
                 raise ValueError(f"{name} must be positive, got {positive!r}")
         if not 0 <= initial_speed <= max_speed:
             raise ValueError(f"initial_speed must lie in 0..max_speed ({max_speed} m/s), got {initial_speed!r}")
-        if not 0 < traffic_speed[0] <= traffic_speed[1] <= SPEED_LIMIT:
+        if np.shape(traffic_speed) != (2,) or not 0 < traffic_speed[0] <= traffic_speed[1] <= SPEED_LIMIT:
             raise ValueError(f"traffic_speed must be a range within 0..{SPEED_LIMIT} m/s, got {traffic_speed!r}")
         for name, weight in [("steer_cost", steer_cost), ("brake_cost", brake_cost), ("crash_penalty", crash_penalty)]:
             if not (np.isfinite(weight) and weight >= 0):
@@ -219,7 +219,6 @@ class HighwayVisionEnv(AbstractEnv):
         self.road = HighwayRoad(HighwayNetwork(self.lanes_count), np_random=self.np_random)
         lane = int(self.np_random.integers(self.lanes_count))
         ego = EgoVehicle.make_on_lane(self.road, ("0", "1", lane), START_X, self.initial_speed)
-        ego.MAX_SPEED = self.max_speed
         self.road.vehicles.append(ego)
         self.vehicle = ego
         traffic.populate(self.road, ego, self.vehicles_count, self.traffic_speed, self.np_random)
@@ -301,9 +300,9 @@ class ReportTimeout(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
 
 def _weather_choices(weather: str | Sequence[str]) -> tuple[str, ...]:
     """The weathers an option stands for."""
-    if weather == "random":
+    if isinstance(weather, str) and weather == "random":
         return WEATHERS
-    choices = (weather,) if isinstance(weather, str) else tuple(weather)
+    choices = (weather,) if isinstance(weather, str) or weather is None else tuple(weather)
     unknown = [name for name in choices if name not in WEATHERS]
     if unknown or not choices:
         raise ValueError(f"weather must be 'random' or among {', '.join(WEATHERS)}; got {weather!r}")

@@ -53,7 +53,8 @@ LINE_WIDTH: Final = 0.2
 DASH_LENGTH: Final = 3.0
 DASH_PERIOD: Final = 12.0
 #: The roadside repeats itself with this period, and positions are taken modulo it: single precision holds on any road.
-WORLD_PERIOD: Final = 240.0
+#: A multiple of all that repeats on its own: dashes (12 m), trees (20 m), joints (4 m) and the verge (64 m).
+WORLD_PERIOD: Final = 960.0
 RAIL_BOTTOM: Final = 0.45
 RAIL_TOP: Final = 0.8
 RAIL_JOINTS: Final = 4.0
@@ -132,38 +133,38 @@ class Roadside:
         shape = (int(WORLD_PERIOD / TREE_SPACING), 2, 2)
         self._jitter = np.random.default_rng(0).uniform(-1, 1, shape) * (4.0, 2.5)
 
-    def faces(self, x: float, instants: int, sight: float) -> Faces:
+    def faces(self, x: Array, sight: float) -> Faces:
         """
-        What can be seen from x, far to near.
+        What can be seen from each x, far to near.
 
-        :param x: Position along the road.
-        :param instants: How often to repeat it; it stands still.
+        :param x: Positions along the road, (instants,).
         :param sight: Distance at which the guard-rails end.
         """
-        number = int(x // TREE_SPACING) + np.arange(int(TREE_RANGE / TREE_SPACING), -1, -1)
+        # Every instant has the faces around its own x, so that it looks the same whichever others are rendered with it.
+        number = (x[:, None] // TREE_SPACING).astype(np.int64) + np.arange(int(TREE_RANGE / TREE_SPACING), -1, -1)
         tree = self._jitter[number % len(self._jitter)]
-        tree[..., 0] += TREE_SPACING * number[:, None]
+        tree[..., 0] += TREE_SPACING * number[..., None]
         tree[..., 1] += self.middle + np.array((-1, 1)) * (self.half_width + 5)
-        tree = tree.reshape(-1, 2)
+        tree = tree.reshape(len(x), -1, 2)
         to_end = np.array((0.0, TREE_HALF_WIDTH))
 
         near, far = x - 5, x + sight
-        left, right = self.middle - self.half_width - 0.5, self.middle + self.half_width + 0.5
-        origin = WORLD_PERIOD * (x // WORLD_PERIOD - 1)
-        s_near, s_far = (near - origin) / RAIL_JOINTS, (far - origin) / RAIL_JOINTS
-        trees, rails = np.ones(len(tree)), np.ones(2)
+        rail_y = np.tile(self.middle + np.array((-1, 1)) * (self.half_width + 0.5), (len(x), 1))  # left, right
+        s_near = near % RAIL_JOINTS / RAIL_JOINTS
+        s_far = s_near + (far - near) / RAIL_JOINTS
+        trees, rails = np.ones(tree.shape[:2]), np.ones((len(x), 2))
         parts = (
-            (tree - to_end, [(near, left), (far, right)]),
-            (tree + to_end, [(far, left), (near, right)]),
-            (np.tile((-1.0, 0.0), (len(tree), 1)), [(0.0, 1.0), (0.0, -1.0)]),
-            (0 * trees, [s_near, s_far]),
-            (trees, [s_far, s_near]),
+            (tree - to_end, np.stack((np.stack((near, far), axis=1), rail_y), axis=-1)),
+            (tree + to_end, np.stack((np.stack((far, near), axis=1), rail_y), axis=-1)),
+            (trees[..., None] * (-1.0, 0.0), rails[..., None] * [(0.0, 1.0), (0.0, -1.0)]),
+            (0 * trees, np.stack((s_near, s_far), axis=1)),
+            (trees, np.stack((s_far, s_near), axis=1)),
             (0 * trees, RAIL_BOTTOM * rails),
             (TREE_HEIGHT * trees, RAIL_TOP * rails),
-            (np.full(len(tree), TREE), [RAIL, RAIL]),
-            (np.full(len(tree), -1), [-1, -1]),
+            (np.full(trees.shape, TREE), np.full(rails.shape, RAIL)),
+            (np.full(trees.shape, -1), np.full(rails.shape, -1)),
         )
-        return Faces(*(np.concatenate(part)[None].repeat(instants, axis=0) for part in parts))
+        return Faces(*(np.concatenate(part, axis=1) for part in parts))
 
 
 def vehicle_faces(poses: Array, sizes: Array, order: IntArray) -> Faces:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from numbers import Integral, Real
 from typing import Any, Final, get_args
 
 import cv2
@@ -53,7 +54,8 @@ class VisionSensors:
         :class:`~sb3_have.sensors.EventCamera`. ``seed`` fixes the chip's threshold mismatch; all noise comes from the
         generators given to :meth:`reset` and :meth:`observe`. With a ``mapping`` other than "log" the event camera
         sees the digital numbers of the colour camera, neither clipped nor rounded.
-    :param depth: Overrides of :data:`DEPTH_DEFAULTS`: ``encoding`` ("log", "clipped", "inverse") and ``max`` in metres.
+    :param depth: Overrides of :data:`DEPTH_DEFAULTS`: ``encoding`` ("log", "clipped", "inverse") and, for the latter
+        two, ``max`` in metres.
     :raises ValueError: on an unknown modality, option or value.
     """
 
@@ -68,22 +70,27 @@ class VisionSensors:
     ) -> None:
         if isinstance(modalities, str) or not modalities or not set(modalities) <= set(MODALITIES):
             raise ValueError(f"modalities must be a non-empty subset of {MODALITIES}, got {modalities!r}")
-        if image_size < 16:
-            raise ValueError(f"image_size must be at least 16, got {image_size}")
-        if lanes_count < 1 or not lane_width > 0:
-            raise ValueError(f"need lanes_count >= 1 and lane_width > 0, got {lanes_count} and {lane_width}")
-        self.image_size = image_size
+        self.image_size = image_size = _whole("image_size", image_size, 16)
+        lanes_count = _whole("lanes_count", lanes_count, 1)
+        if not lane_width > 0:
+            raise ValueError(f"lane_width must be > 0, got {lane_width}")
         self.modalities = tuple(name for name in MODALITIES if name in modalities)
         self.event_options = _options("event", EVENT_DEFAULTS, event)
         self.depth_options = _options("depth", DEPTH_DEFAULTS, depth)
+        if not isinstance(self.depth_options["max"], Real):
+            raise ValueError(f"depth max must be a number of metres, got {self.depth_options['max']!r}")
         encode_depth(np.empty(0), *self.depth_options.values())  # complains about a wrong option now, not at reset
+        if self.depth_options["encoding"] == "log" and "max" in (depth or {}):
+            raise ValueError(
+                f"depth max={self.depth_options['max']!r} has no effect with encoding 'log', whose range is fixed; "
+                "leave it out or choose encoding 'clipped' or 'inverse'"
+            )
         self.camera = Camera(image_size, lanes_count, lane_width)
 
         chip = dict(self.event_options)
-        self.bins, self.subframes = int(chip.pop("bins")), int(chip.pop("subframes"))
+        self.bins = _whole("event bins", chip.pop("bins"), 1)
+        self.subframes = _whole("event subframes", chip.pop("subframes"), 1)
         self._representation = chip.pop("representation")
-        if self.bins < 1 or self.subframes < 1:
-            raise ValueError(f"event bins and subframes must be at least 1, got {self.bins} and {self.subframes}")
         self.event_camera = EventCamera(image_size, image_size, **chip)
         if self._representation not in get_args(Representation):
             known = get_args(Representation)
@@ -138,7 +145,7 @@ class VisionSensors:
         if len(poses) < 2 or not duration > 0:
             raise ValueError(f"need at least 2 instants and a positive duration, got {len(poses)} and {duration}")
         if "event" in self.modalities:
-            at = np.arange(1, self.subframes + 1) * ((len(poses) - 1) / self.subframes)
+            at = np.arange(1, self.subframes + 1) * (len(poses) - 1) / self.subframes  # ends exactly on the last
             before = np.minimum(at.astype(int), len(poses) - 2)
             share = (at - before)[:, None, None]
             poses = (1 - share) * poses[before] + share * poses[before + 1]
@@ -174,13 +181,15 @@ class VisionSensors:
     def _sense(self, poses: Array, duration: float, rng: np.random.Generator) -> Observation:
         objects = self.camera.objects(poses, self._sizes)
         self._view = last = objects.last(len(poses), self.image_size**2)
+        # A generator each, always drawn: the noise of one sensor does not depend on which others there are.
+        picture_rng, event_rng = (np.random.default_rng(seed) for seed in rng.integers(2**63, size=2))
         observation: Observation = {}
         if "rgb" in self.modalities:
             ground = self.camera.ground(poses[-1:])
-            observation["rgb"] = take_picture(self._colour.render(ground, last)[0], self.weather, rng)
+            observation["rgb"] = take_picture(self._colour.render(ground, last)[0], self.weather, picture_rng)
         if "event" in self.modalities:
             ground = self.camera.ground(poses)
-            observation["event"] = self._events(self._brightness.render(ground, objects)[..., 0], duration, rng)
+            observation["event"] = self._events(self._brightness.render(ground, objects)[..., 0], duration, event_rng)
         if "depth" in self.modalities:
             depth = self.camera.depth(last)
             observation["depth"] = encode_depth(depth, *self.depth_options.values())[..., None]
@@ -201,6 +210,12 @@ class VisionSensors:
         pixel, time, polarity = (np.concatenate(part) for part in zip(*parts, strict=True))
         counts = represent(pixel, time, polarity, self.bins, start, self._time, size, size, self._representation)
         return encode_events(counts)
+
+
+def _whole(name: str, value: Any, least: int) -> int:
+    if not isinstance(value, Integral) or value < least:
+        raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
+    return int(value)
 
 
 def _options(name: str, defaults: Mapping[str, Any], given: Mapping[str, Any] | None) -> dict[str, Any]:

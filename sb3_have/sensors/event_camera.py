@@ -40,12 +40,13 @@ class EventCamera:
         property of the chip. Draws are floored at a tenth of the nominal threshold.
     :param refractory: Dead time of a pixel after an event, in seconds. A crossing in the dead time is lost, and the
         reference moves all the same (as in ESIM).
-    :param leak_rate: Rate of spurious positive events per pixel, in Hz, from the drift of the reference.
+    :param leak_rate: Rate of spurious positive events per pixel, in Hz, from the drift of the reference. Every pixel
+        leaks at its own phase, drawn once: at a reset its reference lies that share of a threshold below the level.
     :param shot_rate: Rate of random events per pixel, in Hz, half of them positive. They leave the reference alone.
     :param mapping: ``"log"``: log(log_eps + I); ``"lin_log"``: v2e's mapping of numbers 0..255, linear below 20;
         ``"identity"``: the frame is taken as it is (it may already be a logarithm).
     :param log_eps: Added to the intensity before the logarithm; it sets how dark the sensor still sees.
-    :param seed: Seed of the threshold mismatch and of the noise.
+    :param seed: Seed of the threshold mismatch, the leak phases and the noise.
     :raises ValueError: on a parameter out of its range.
     """
 
@@ -93,10 +94,12 @@ class EventCamera:
         mismatch = self._rng.standard_normal((2, height * width)) * threshold_sigma
         #: Thresholds of every pixel, shape (2, height * width): positive, negative.
         self.thresholds: FloatArray = np.maximum(nominal[:, None] + mismatch, 0.1 * nominal[:, None])
+        # Shares of a threshold; without a phase the whole sensor would flash at once.
+        self._leak_phase: FloatArray = self._rng.random(height * width) if leak_rate else np.zeros(height * width)
         self.reset()
 
     def reset(self) -> None:
-        """Forget the scene: the next frame only sets the reference. The threshold mismatch stays."""
+        """Forget the scene: the next frame only sets the reference. The thresholds and leak phases stay."""
         self._time: float | None = None
         self._start = 0.0
         self._level: FloatArray = np.zeros(self.height * self.width)
@@ -132,7 +135,7 @@ class EventCamera:
         level = self._map(frame)
         if self._time is None:
             self._time = self._start = t
-            self._level, self._reference = level, level.copy()
+            self._level, self._reference = level, level - self._leak_phase * self.thresholds[0]
             return np.empty(0, np.int64), np.empty(0), np.empty(0)
         if not t > self._time:
             raise ValueError(f"time must advance: got t={t!r} after t={self._time!r}; call reset() to start anew")
@@ -183,7 +186,8 @@ class EventCamera:
         count = np.floor(gap / step)
         count += sign * (reference + (count + 1) * step) <= sign * end
         count -= sign * (reference + count * step) > sign * end
-        fired = count > 0
+        # The moved reference is rounded: it may leave a level that has come to rest on a threshold just beyond it.
+        fired = (count > 0) & (end != start)
         pixel, start, end, reference = pixel[fired], start[fired], end[fired], reference[fired]
         sign, step, repeats = sign[fired], step[fired], count[fired].astype(np.int64)
 

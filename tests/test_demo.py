@@ -1,0 +1,31 @@
+"""The demo from end to end, on a small stand-in for the highway."""
+
+from pathlib import Path
+
+import pandas as pd
+import pytest
+from fake_drive import ENV_ID
+from PIL import Image
+from test_train import CONFIG
+
+from sb3_have import HAVESAC, demo
+
+
+def test_the_demo_writes_all_of_its_results_and_can_be_repeated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(demo, "ENV_ID", ENV_ID)
+    config = {**CONFIG, "policy_kwargs": {"features_dim": 4, "net_arch": [8]}}
+    monkeypatch.setattr(demo, "load_config", lambda *_: config)
+    monkeypatch.setattr(demo, "WEATHERS", ("slow", "fast"))
+    monkeypatch.setattr(demo, "SHOWN", "fast")
+    for steps in (20, 30):  # the second run finds the results of the first in its folder
+        demo.main(["--steps", str(steps), "--episodes", "1", "--out", str(tmp_path)])
+        assert HAVESAC.load(tmp_path / "havesac_demo.zip").num_timesteps == steps
+    table = pd.read_csv(tmp_path / "evaluation.csv")
+    assert list(table["driver"].unique()) == ["HAVESAC", "random", "straight at 25 m/s", "straight at 20 m/s"]
+    assert list(table["weather"]) == ["slow", "fast"] * 4
+    assert "ER" in capsys.readouterr().out
+    for name in ("learning_curve.png", "modality_weights.png", "drive.gif"):
+        with Image.open(tmp_path / name) as picture:
+            assert picture.width > 100
