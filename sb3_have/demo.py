@@ -29,7 +29,7 @@ from sb3_have.train import Run, evaluation_env_kwargs, load_config
 
 ENV_ID = "HighwayVision-v0"
 STEPS = 10_000
-MINUTES = 10.5
+MINUTES = 11.5
 """Training stops here on a slow machine, so that the whole demo stays within a quarter of an hour."""
 EPISODES = 2
 PROCESSES = 2
