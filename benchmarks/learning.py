@@ -32,6 +32,8 @@ DRIVERS = {
 def evaluate_runs(runs: list[Path], episodes: int) -> None:
     """Evaluate the final model of each run, and keep its training episodes."""
     LEARNING.mkdir(parents=True, exist_ok=True)
+    for old in LEARNING.glob("monitor-*.csv"):
+        old.unlink()
     env_kwargs = evaluation_env_kwargs(load_config("havesac", ENV_ID))
     frames = []
     for run in runs:
@@ -63,7 +65,7 @@ def draw(out: Path, window: int = 20) -> None:
     levels = dict(zip(table["setting"], table["distance_mean"].astype(float), strict=True))
     for (name, setting), style in zip(DRIVERS.items(), (":", "--", "-.", "-"), strict=True):
         axes.axhline(levels[setting], color="grey", linestyle=style, linewidth=1, label=name)
-    axes.set(xlabel="environment steps", ylabel=f"distance [m], mean of {window} episodes", ylim=(0, None))
+    axes.set(xlabel="environment steps in finished episodes", ylabel=f"distance [m], mean of {window} episodes", ylim=(0, None))
     axes.legend(fontsize="small", ncols=2)
     figure.savefig(out, dpi=100)
     print(f"wrote {out}")

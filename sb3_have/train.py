@@ -193,7 +193,7 @@ class Run:
         eval_episodes: int = 2,
         eval_envs: int = 1,
         weathers: Sequence[str] = WEATHERS,
-        save_freq: int = 20_000,
+        save_freq: int = 5_000,
         time_limit: float | None = None,
         device: str = "auto",
     ) -> None:
@@ -350,7 +350,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--eval-freq", type=int, default=10_000, help="steps between evaluations, 0 for none")
     parser.add_argument("--eval-episodes", type=int, default=2, help="in each weather")
     parser.add_argument("--eval-envs", type=int, default=1, help="processes that evaluate")
-    parser.add_argument("--save-freq", type=int, default=20_000, help="steps between checkpoints")
+    parser.add_argument("--save-freq", type=int, default=5_000, help="steps between checkpoints")
     parser.add_argument("--time-limit", type=float, help="seconds of training in this session")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--progress-bar", action="store_true")

@@ -41,6 +41,7 @@ class HAVESAC(SAC):
         (global value alone), the paper's ablations
     :param refusion: form of the re-fusion network: "convex", "monotone" or "free" (the paper's), see
         :class:`~sb3_have.have.critic.RefusionNetwork`
+    :param policy_kwargs: of :class:`MultiModalPolicy`; may give ``value_estimation`` and ``refusion`` in its place
     :param target: "bellman": y = r + gamma (1 - done) (min_k H'_k - alpha log pi). "paper": Eq. 10 as it is written,
         both sides of the Bellman equation mixed, y = min_k H'_k(y_g, y_l) with y_j = r + gamma (1 - done)
         (q'_j - alpha log pi). With "convex" re-fusion the two are equal; with "free" the second one diverges.
@@ -155,7 +156,7 @@ class HAVESAC(SAC):
         # Here and not in the constructor, because `load` sets attributes in between
         if self.target not in TARGETS:
             raise ValueError(f"target={self.target!r}: expected one of {TARGETS}.")
-        if self.local_coef < 0:
+        if not self.local_coef >= 0:
             raise ValueError(f"local_coef={self.local_coef}: expected a number >= 0.")
         if not 0 <= self.modality_dropout < 1:
             raise ValueError(f"modality_dropout={self.modality_dropout}: expected a probability in [0, 1).")
