@@ -65,7 +65,11 @@ def draw(out: Path, window: int = 20) -> None:
     levels = dict(zip(table["setting"], table["distance_mean"].astype(float), strict=True))
     for (name, setting), style in zip(DRIVERS.items(), (":", "--", "-.", "-"), strict=True):
         axes.axhline(levels[setting], color="grey", linestyle=style, linewidth=1, label=name)
-    axes.set(xlabel="environment steps in finished episodes", ylabel=f"distance [m], mean of {window} episodes", ylim=(0, None))
+    axes.set(
+        xlabel="environment steps in finished episodes",
+        ylabel=f"distance [m], mean of {window} episodes",
+        ylim=(0, None),
+    )
     axes.legend(fontsize="small", ncols=2)
     figure.savefig(out, dpi=100)
     print(f"wrote {out}")
