@@ -1,0 +1,293 @@
+"""Replay memory for stacked images: every frame is stored once."""
+
+import os
+from typing import Any
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.preprocessing import is_image_space
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecNormalize, unwrap_vec_wrapper
+
+from sb3_have.common.frames import EMPTY, FramePool
+
+Observation = np.ndarray | dict[str, np.ndarray]
+
+
+class ModalityReplayBuffer(ReplayBuffer):
+    """
+    SB3's ``DictReplayBuffer`` (and ``ReplayBuffer``) in a fraction of the memory, with n-step returns.
+
+    A stack of k frames shares k - 1 of them with the next one, and ``next_obs`` is the following ``obs``; so each frame
+    is stored once, and a transition is 2 k slot numbers. A stack that does not continue the last one (reset,
+    truncation, a loaded buffer, a wrapper that changes it) is stored anew. Therefore samples are exactly what SB3's
+    buffers hold, whatever is added and whatever ``n_stack`` is; only the memory depends on it. All ``buffer_size``
+    transitions are always there. Indices are drawn as SB3 does, so the same seed gives the same batch.
+
+    SB3 takes it too: ``SAC("MultiInputPolicy", env, replay_buffer_class=ModalityReplayBuffer,
+    replay_buffer_kwargs=dict(n_stack=stacked_frames(env)))``.
+
+    Asked for in SB3 issues #37 and #1936 and PR #243 (n-step and memory for Dict observations).
+
+    :param buffer_size: transitions, over all environments
+    :param observation_space: Dict of Boxes or other array-valued spaces, or a Box; images (kC, H, W) are split into k
+        frames, every other key is stored whole, once a step
+    :param action_space: as in SB3
+    :param device: where samples go
+    :param n_envs: number of parallel environments
+    :param optimize_memory_usage: must be False, frames are stored once anyway
+    :param handle_timeout_termination: as in SB3: a truncated episode is not a termination
+    :param n_stack: k, the frames in a stacked image, see :func:`stacked_frames`; HAVESAC finds it
+    :param n_steps: length of n-step returns; they end with the episode, at the last transition written, and where the
+        observations do not continue
+    :param gamma: discount of n-step returns
+    :param storage: "memory", "mmap" (temporary files, for more than fits into memory) or "device" (frames on the
+        device, where CUDA gathers them without the host)
+    :param mmap_dir: directory for the files of "mmap"; by default the system's for temporary files
+    :raises ValueError: for bad arguments; the message names them
+    """
+
+    def __init__(
+        self,
+        buffer_size: int,
+        observation_space: spaces.Space[Any],
+        action_space: spaces.Space[Any],
+        device: th.device | str = "auto",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
+        handle_timeout_termination: bool = True,
+        n_stack: int = 1,
+        n_steps: int = 1,
+        gamma: float = 0.99,
+        storage: str = "memory",
+        mmap_dir: str | os.PathLike[str] | None = None,
+    ):
+        super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs=n_envs)
+        if optimize_memory_usage:
+            raise ValueError("optimize_memory_usage=True: leave it False, this buffer stores every frame once anyway.")
+        if n_stack < 1 or n_steps < 1:
+            raise ValueError(f"n_stack={n_stack}, n_steps={n_steps}: expected whole numbers from 1 on.")
+        self.buffer_size = max(buffer_size // n_envs, 1)
+        self.optimize_memory_usage = False
+        self.handle_timeout_termination = handle_timeout_termination
+        self.n_stack, self.n_steps, self.gamma = n_stack, n_steps, gamma
+
+        self.shapes: dict[str, tuple[int, ...]] = (
+            self.obs_shape if isinstance(self.obs_shape, dict) else {"observation": self.obs_shape}
+        )
+        subspaces = observation_space.spaces if isinstance(observation_space, spaces.Dict) else None
+        frame_shapes, dtypes, self.stacked_keys = {}, {}, []
+        for key, shape in self.shapes.items():
+            space = observation_space if subspaces is None else subspaces[key]
+            dtypes[key] = np.dtype(space.dtype)
+            frame_shapes[key] = shape
+            if n_stack > 1 and is_image_space(space) and np.argmin(shape) == 0:  # channels first
+                if shape[0] % n_stack:
+                    raise ValueError(
+                        f"n_stack={n_stack}: observation key {key!r} has {shape[0]} channels, which are not {n_stack} "
+                        "frames; give the number of frames that VecFrameStack stacks."
+                    )
+                frame_shapes[key] = (shape[0] // n_stack, *shape[1:])
+                self.stacked_keys.append(key)
+
+        n_slots = 1 + self.n_envs * (self.buffer_size + self.buffer_size // 16 + n_stack + 1)
+        self.pool = FramePool(n_slots, frame_shapes, dtypes, storage, self.device, mmap_dir)
+        self.slots = np.full((self.buffer_size, self.n_envs, 2, n_stack), EMPTY, np.int32)  # of obs and next_obs
+        self.continues = np.zeros((self.buffer_size, self.n_envs), bool)  # obs is the last next_obs
+        self._last_next: dict[str, np.ndarray] | None = None
+        self.actions = np.zeros(
+            (self.buffer_size, self.n_envs, self.action_dim), self._maybe_cast_dtype(action_space.dtype)
+        )
+        self.rewards = np.zeros((self.buffer_size, self.n_envs), np.float32)
+        self.dones = np.zeros((self.buffer_size, self.n_envs), np.float32)
+        self.timeouts = np.zeros((self.buffer_size, self.n_envs), np.float32)
+
+    def add(
+        self,
+        obs: Observation,
+        next_obs: Observation,
+        action: np.ndarray,
+        reward: np.ndarray,
+        done: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """
+        Stores one transition of every environment.
+
+        :param obs: stacked observations (n_envs, ...), one array for each key
+        :param next_obs: the same; of an episode that ends, its last observation and not the reset's
+        :param action: (n_envs, action_dim)
+        :param reward: (n_envs,)
+        :param done: (n_envs,), 1 where the episode ended
+        :param infos: with "TimeLimit.truncated" where it ended by time
+        """
+        stacks, next_stacks = self._as_dict(obs), self._as_dict(next_obs)
+        successor = (self.pos + 1) % self.buffer_size
+        for env in range(self.n_envs):
+            old = set(self.slots[self.pos, env].ravel().tolist())
+            slots, next_slots = self._store(
+                env,
+                {key: value[env] for key, value in stacks.items()},
+                {key: value[env] for key, value in next_stacks.items()},
+            )
+            self.slots[self.pos, env] = slots, next_slots
+            # a slot that the next older transition does not use is used by none: stacks only move forward
+            self.pool.give_back(old - set(self.slots[successor, env].ravel().tolist()) - {EMPTY})
+        self._last_next = {key: value.copy() for key, value in next_stacks.items()}
+
+        self.actions[self.pos] = np.reshape(action, (self.n_envs, self.action_dim))
+        self.rewards[self.pos] = reward
+        self.dones[self.pos] = done
+        if self.handle_timeout_termination:
+            self.timeouts[self.pos] = [info.get("TimeLimit.truncated", False) for info in infos]
+        self.pos += 1
+        if self.pos == self.buffer_size:
+            self.full = True
+            self.pos = 0
+
+    def _as_dict(self, observation: Observation) -> dict[str, np.ndarray]:
+        observations = observation if isinstance(observation, dict) else {"observation": observation}
+        return {key: np.reshape(observations[key], (self.n_envs, *shape)) for key, shape in self.shapes.items()}
+
+    def _store(
+        self, env: int, stack: dict[str, np.ndarray], next_stack: dict[str, np.ndarray]
+    ) -> tuple[list[int], list[int]]:
+        """Slots of the two stacks of a transition; what is there already is not written again."""
+        last = self._last_next
+        self.continues[self.pos, env] = last is not None and all(
+            np.array_equal(stack[key], last[key][env]) for key in stack
+        )
+        slots = self.slots[self.pos - 1, env, 1].tolist() if self.continues[self.pos, env] else self._store_stack(stack)
+        frames = {key: self._split(key, stack[key]) for key in self.stacked_keys}
+        next_frames = {key: self._split(key, next_stack[key]) for key in self.stacked_keys}
+        if all(np.array_equal(frames[key][1:], next_frames[key][:-1]) for key in self.stacked_keys):
+            return slots, [*slots[1:], self._store_newest(next_stack)]
+        return slots, self._store_stack(next_stack)
+
+    def _store_stack(self, stack: dict[str, np.ndarray]) -> list[int]:
+        """Stores every frame of a stack; padding, by zeros or by repetition, takes no slot of its own."""
+        slots = [self._store_newest(stack)]
+        frames = {key: self._split(key, stack[key]) for key in self.stacked_keys}
+        for j in range(self.n_stack - 2, -1, -1):
+            if all(not frames[key][j].any() for key in frames):
+                slots.append(EMPTY)
+            elif all(np.array_equal(frames[key][j], frames[key][j + 1]) for key in frames):
+                slots.append(slots[-1])
+            else:
+                slots.append(self.pool.take())
+                self.pool.write(slots[-1], {key: frames[key][j] for key in frames})
+        return slots[::-1]
+
+    def _store_newest(self, stack: dict[str, np.ndarray]) -> int:
+        """Stores the newest frame of the images, and all of the other keys."""
+        slot = self.pool.take()
+        frames = {key: self._split(key, stack[key])[-1] if key in self.stacked_keys else stack[key] for key in stack}
+        self.pool.write(slot, frames)
+        return slot
+
+    def _split(self, key: str, stack: np.ndarray) -> np.ndarray:
+        """(kC, H, W) to (k, C, H, W)."""
+        return stack.reshape(self.n_stack, *self.pool.shapes[key])
+
+    def _get_samples(  # type: ignore[override]
+        self, batch_inds: np.ndarray, env: VecNormalize | None = None
+    ) -> DictReplayBufferSamples | ReplayBufferSamples:
+        env_indices = np.random.randint(0, self.n_envs, size=len(batch_inds))
+        if self.n_steps == 1:
+            last_inds, discounts = batch_inds, None
+            rewards = self._normalize_reward(self.rewards[batch_inds, env_indices], env)
+        else:
+            last_inds, rewards, discounts = self._n_step_returns(batch_inds, env_indices, env)
+        dones = self.dones[last_inds, env_indices] * (1 - self.timeouts[last_inds, env_indices])
+        observations, next_observations = self._gather(
+            np.stack([self.slots[batch_inds, env_indices, 0], self.slots[last_inds, env_indices, 1]]), env
+        )
+        samples = DictReplayBufferSamples(
+            observations=observations,
+            actions=self._to_device(th.from_numpy(self.actions[batch_inds, env_indices])),
+            next_observations=next_observations,
+            dones=self._to_device(th.from_numpy(dones.reshape(-1, 1))),
+            rewards=self._to_device(th.from_numpy(rewards.reshape(-1, 1))),
+            discounts=None if discounts is None else self._to_device(th.from_numpy(discounts.reshape(-1, 1))),
+        )
+        if isinstance(self.observation_space, spaces.Dict):
+            return samples
+        return ReplayBufferSamples(
+            **samples._asdict()
+            | {"observations": observations["observation"], "next_observations": next_observations["observation"]}
+        )
+
+    def _gather(self, slots: np.ndarray, env: VecNormalize | None) -> tuple[dict[str, th.Tensor], dict[str, th.Tensor]]:
+        """Observations and next observations, from their slots (2, batch, k)."""
+        self.pool.to(self.device)
+        pairs = {}
+        for key, shape in self.shapes.items():
+            key_slots = slots if key in self.stacked_keys else slots[:, :, -1]  # a whole key is in the newest slot
+            frames = self.pool.gather(key, key_slots.ravel(), pin_memory=self.device.type == "cuda")
+            pairs[key] = frames.view(2, -1, *shape)
+        obs, next_obs = ({key: pair[i] for key, pair in pairs.items()} for i in range(2))
+        if env is not None and env.norm_obs:
+            obs, next_obs = obs | self._normalized(obs, env), next_obs | self._normalized(next_obs, env)
+        return (
+            {key: self._to_device(value) for key, value in obs.items()},
+            {key: self._to_device(value) for key, value in next_obs.items()},
+        )
+
+    def _normalized(self, observations: dict[str, th.Tensor], env: VecNormalize) -> dict[str, th.Tensor]:
+        """The keys that VecNormalize normalises; it copies whatever it is given, so it is not given the others."""
+        if not isinstance(self.observation_space, spaces.Dict):
+            array = self._normalize_obs(observations["observation"].cpu().numpy(), env)
+            return {"observation": th.as_tensor(array)}
+        assert env.norm_obs_keys is not None
+        arrays = self._normalize_obs({key: observations[key].cpu().numpy() for key in env.norm_obs_keys}, env)
+        return {key: th.as_tensor(arrays[key]) for key in env.norm_obs_keys}
+
+    def _to_device(self, tensor: th.Tensor) -> th.Tensor:
+        if self.device.type == "cuda" and tensor.device.type == "cpu":
+            return tensor.pin_memory().to(self.device, non_blocking=True)
+        return tensor.to(self.device)
+
+    def _n_step_returns(
+        self, batch_inds: np.ndarray, env_indices: np.ndarray, env: VecNormalize | None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """
+        :param batch_inds: (batch,) the first transitions
+        :param env_indices: (batch,) their environments
+        :param env: for the normalisation of rewards
+        :return: index of each last transition, the discounted returns and the discounts gamma^m, (batch,) each
+        """
+        indices = (batch_inds[:, None] + np.arange(self.n_steps)) % self.buffer_size  # (batch, n)
+        envs = env_indices[:, None]
+        ends = (self.dones[indices, envs] + self.timeouts[indices, envs]) > 0
+        ends |= indices == (self.pos - 1) % self.buffer_size  # the last one written
+        ends |= ~self.continues[(indices + 1) % self.buffer_size, envs]
+        n_rewards = np.where(ends.any(axis=1), ends.argmax(axis=1) + 1, self.n_steps)
+        discounts = self.gamma ** np.arange(self.n_steps, dtype=np.float32)
+        rewards = self._normalize_reward(self.rewards[indices, envs], env)
+        returns = (rewards * discounts * (np.arange(self.n_steps) < n_rewards[:, None])).sum(axis=1)
+        last_inds = (batch_inds + n_rewards - 1) % self.buffer_size
+        return last_inds, returns, self.gamma ** n_rewards.astype(np.float32)
+
+    def truncate_last_trajectory(self) -> None:
+        """Lets no n-step return run from what is stored into what is added next, as after loading the buffer."""
+        self._last_next = None
+
+    def reset(self) -> None:
+        super().reset()
+        self.pool.give_back(set(self.slots.ravel().tolist()) - {EMPTY})
+        self.slots[:] = EMPTY
+        self._last_next = None
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes held: the frames in use and the tables."""
+        tables = (self.slots, self.continues, self.actions, self.rewards, self.dones, self.timeouts)
+        return self.pool.nbytes + sum(table.nbytes for table in tables)
+
+
+def stacked_frames(env: VecEnv) -> int:
+    """The number of frames that ``VecFrameStack`` stacks somewhere in a chain of wrappers, 1 without it."""
+    wrapper = unwrap_vec_wrapper(env, VecFrameStack)
+    return 1 if wrapper is None else wrapper.stacked_obs.n_stack
