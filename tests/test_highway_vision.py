@@ -15,13 +15,12 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as check_gymnasium_env
 from highway_env.envs.common.observation import ObservationType
-from highway_env.road.road import Road, RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 from stable_baselines3.common.env_checker import check_env as check_sb3_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_have.envs import HighwayVisionEnv, traffic
-from sb3_have.envs.road import LANE_WIDTH, ROAD_LENGTH
+from sb3_have.envs.road import LANE_WIDTH
 from sb3_have.envs.weather import WEATHERS
 
 MODALITIES = ("rgb", "event", "depth")
@@ -339,44 +338,6 @@ def test_a_road_too_full_queues_out_of_sight() -> None:
     for _ in range(30):
         env.step(STRAIGHT)
     assert not any(v.crashed for v in env.road.vehicles)
-
-
-class StockRoadEnv(BlindEnv):
-    """The same scene on highway-env's own road."""
-
-    def _reset(self) -> None:
-        super()._reset()
-        road = Road(
-            RoadNetwork.straight_road_network(self.lanes_count, length=ROAD_LENGTH),
-            vehicles=self.road.vehicles,
-            np_random=self.np_random,
-        )
-        for vehicle in road.vehicles:
-            vehicle.road = road
-            vehicle.lane = road.network.get_lane(vehicle.lane_index)
-        self.road = road
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_road_equals_the_stock_road_bit_for_bit(seed: int) -> None:
-    fast, stock = BlindEnv(), StockRoadEnv()
-    fast.reset(seed=seed)
-    stock.reset(seed=seed)
-    rng = np.random.default_rng(seed)
-    recycled = 0
-    for _ in range(150):
-        action = np.array([rng.uniform(-0.5, 1.0), rng.uniform(-0.3, 0.3)])
-        before = list(fast.road.vehicles)
-        one, other = fast.step(action), stock.step(action)
-        assert np.array_equal(fast._snapshot(), stock._snapshot())
-        assert [v.speed for v in fast.road.vehicles] == [v.speed for v in stock.road.vehicles]
-        assert [v.crashed for v in fast.road.vehicles] == [v.crashed for v in stock.road.vehicles]
-        assert one[1:4] == other[1:4]
-        recycled += sum(old is not new for old, new in zip(before, fast.road.vehicles, strict=True))
-        if one[2] or one[3]:
-            fast.reset()
-            stock.reset()
-    assert recycled > 0
 
 
 # ---- determinism, processes ----

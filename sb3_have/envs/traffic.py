@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import numpy as np
 from highway_env.road.road import Road
-from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.kinematics import Vehicle
+
+from sb3_have.envs.driver import Driver
 
 SIGHT = 300.0
 """No vehicle appears nearer than this ahead of the ego vehicle [m]."""
@@ -68,14 +69,14 @@ def recycle(road: Road, ego: Vehicle, speeds: tuple[float, float], rng: np.rando
     return replaced
 
 
-def _random_vehicle(road: Road, x: float, speeds: tuple[float, float], rng: np.random.Generator) -> IDMVehicle:
+def _random_vehicle(road: Road, x: float, speeds: tuple[float, float], rng: np.random.Generator) -> Driver:
     lanes = road.network.all_side_lanes(("0", "1", 0))
-    vehicle = IDMVehicle.make_on_lane(road, lanes[rng.integers(len(lanes))], x, rng.uniform(*speeds))
-    vehicle.DELTA = rng.uniform(*IDMVehicle.DELTA_RANGE)
+    vehicle: Driver = Driver.make_on_lane(road, lanes[rng.integers(len(lanes))], x, rng.uniform(*speeds))
+    vehicle.DELTA = rng.uniform(*Driver.DELTA_RANGE)
     return vehicle
 
 
-def _has_room(vehicle: IDMVehicle) -> bool:
+def _has_room(vehicle: Driver) -> bool:
     """Whether all gaps in the vehicle's lane are what IDM wants (and never under two car lengths).
 
     Who is changing into the lane counts as being there: MOBIL does not look again after it has decided.
