@@ -241,10 +241,10 @@ def make_model(estimation: str, refusion: str, target: str, local_coef: float) -
 
 
 def draw_noise() -> Array:
-    """What ``train`` draws after the same seed: for the policy's actions, then for the next ones."""
+    """What ``train`` draws after the same seed: for the next actions first, so the order of ``Reference`` reversed."""
     th.manual_seed(7)
     zeros, ones = th.zeros(BATCH, 2), th.ones(BATCH, 2)
-    noise = np.stack([th.normal(zeros, ones).double().numpy() for _ in range(2)])
+    noise = np.stack([th.normal(zeros, ones).double().numpy() for _ in range(2)][::-1])
     th.manual_seed(7)
     return noise
 

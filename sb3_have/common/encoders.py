@@ -5,6 +5,7 @@ from functools import cache
 from itertools import pairwise
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import torch as th
 import torch.nn.functional as F
@@ -41,18 +42,17 @@ class ImageEncoder(nn.Module):
             layers = default_layers(min(height, width))
         modules: list[nn.Module] = []
         for filters, kernel_size, stride in layers:
-            modules += [nn.Conv2d(channels, filters, kernel_size, stride), nn.ReLU()]
+            modules += [nn.Conv2d(channels, filters, kernel_size, stride), nn.ReLU(inplace=True)]
             channels = filters
-        self.convolutions = nn.Sequential(*modules, nn.Flatten())
+        self.convolutions = nn.Sequential(*modules)
         with th.no_grad():
-            n_flatten = self.convolutions(th.zeros(1, *observation_space.shape)).shape[1]
+            n_flatten = self.convolutions(th.zeros(1, *observation_space.shape)).numel()
         self.projection = nn.Sequential(nn.Linear(n_flatten, features_dim), nn.LayerNorm(features_dim))
         self.to(memory_format=th.channels_last)  # type: ignore[call-overload]
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        features: th.Tensor = self.projection(
-            self.convolutions(observations.contiguous(memory_format=th.channels_last))
-        )
+        maps = self.convolutions(observations.contiguous(memory_format=th.channels_last))
+        features: th.Tensor = self.projection(maps.permute(0, 2, 3, 1).flatten(start_dim=1))  # a view, not a copy
         return features
 
 
@@ -172,7 +172,7 @@ class MultiModalEncoder(nn.Module):
         features = []
         for encoder, (name, modality) in zip(self.encoders, self.modalities.items(), strict=True):
             observation = observations[modality.keys[0]]
-            dtype = self._image_dtype(observation.device) if modality.is_image else th.float32
+            dtype = self.image_dtype(observation.device) if modality.is_image else th.float32
             decoded = [self._decode(key, observations[key], modality.is_image, dtype) for key in modality.keys]
             inputs = decoded[0] if len(decoded) == 1 else th.cat(decoded, dim=1)
             with th.autocast(observation.device.type, dtype=dtype, enabled=dtype != th.float32):
@@ -185,22 +185,42 @@ class MultiModalEncoder(nn.Module):
             features.append(encoded.float())
         return th.stack(features, dim=1)
 
-    def _image_dtype(self, device: th.device) -> th.dtype:
+    def image_dtype(self, device: th.device) -> th.dtype:
+        """The arithmetic of the image encoders on ``device``."""
         bfloat16 = self.precision == "bfloat16" or (self.precision == "auto" and has_native_bfloat16(device.type))
         return th.bfloat16 if bfloat16 else th.float32
 
     def _decode(self, key: str, observation: th.Tensor, is_image: bool, dtype: th.dtype) -> th.Tensor:
         if not is_image:
             return observation.to(dtype).flatten(start_dim=1)
-        # channels last while still in bytes, arithmetic in float32, then bfloat16: the fastest order on a CPU
-        values = observation.contiguous(memory_format=th.channels_last).to(th.float32, copy=True)
+        observation = observation.contiguous(memory_format=th.channels_last)  # while still in bytes
         if not self.normalize_images:
-            pass
-        elif key in self.signed_keys:
-            values = F.threshold(values.sub_(128), -127.5, 0.0, inplace=True).mul_(EVENT_SCALE)  # 0 is "no data"
-        else:
-            values = values.mul_(1 / 255)
-        return values.to(dtype)
+            return observation.to(dtype)
+        signed = key in self.signed_keys
+        if observation.dtype == th.uint8 and observation.device.type == "cpu":
+            return _look_up(observation, signed, dtype)
+        return decode_bytes(observation, signed).to(dtype)
+
+
+def decode_bytes(values: th.Tensor, signed: bool) -> th.Tensor:
+    """What the bytes of an image stand for, in float32, see :class:`MultiModalEncoder`."""
+    if signed:
+        return F.threshold(values.to(th.float32) - 128, -127.5, 0.0) * EVENT_SCALE  # 0 is "no data"
+    return values.to(th.float32) / 255
+
+
+def _look_up(observation: th.Tensor, signed: bool, dtype: th.dtype) -> th.Tensor:
+    """:func:`decode_bytes` of a channels-last uint8 image on the CPU, by a table: one pass instead of five."""
+    batch, channels, height, width = observation.shape
+    values = cv2.LUT(observation.permute(0, 2, 3, 1).numpy().reshape(batch, -1), _table(signed, dtype))
+    return th.from_numpy(values).view(dtype).view(batch, height, width, channels).permute(0, 3, 1, 2)
+
+
+@cache
+def _table(signed: bool, dtype: th.dtype) -> np.ndarray:
+    """The 256 values of :func:`decode_bytes`; OpenCV knows no bfloat16, so that one is given as its bits."""
+    table = decode_bytes(th.arange(256), signed).to(dtype)
+    return (table.view(th.int16) if dtype == th.bfloat16 else table).numpy()
 
 
 @cache

@@ -1,7 +1,7 @@
 """Auxiliary losses on the critic's features: the interface, and the callback that switches and schedules them."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from typing import TYPE_CHECKING, ClassVar, NamedTuple
 
 import torch as th
@@ -98,3 +98,51 @@ class AuxiliaryLossCallback(BaseCallback):
         factor = 1.0 if self.schedule is None else self.schedule(progress_remaining)
         for term, coefficient in self.coefficients.items():
             self.model.auxiliary_coefs[term] = factor * coefficient
+
+
+def auxiliary_classes(
+    auxiliary: str | Mapping[str, type[AuxiliaryLoss]] | None, known: Mapping[str, type[AuxiliaryLoss]]
+) -> dict[str, type[AuxiliaryLoss]]:
+    """
+    The losses that are switched on, by name.
+
+    :param auxiliary: HAVESAC's argument
+    :param known: the losses that a name alone stands for
+    :raises ValueError: if it is neither a known name, None, nor a mapping of names to classes
+    """
+    if auxiliary is None:
+        return {}
+    if isinstance(auxiliary, str):
+        if auxiliary not in known:
+            raise ValueError(
+                f"auxiliary={auxiliary!r}: expected one of {list(known)}, None, or {{name: AuxiliaryLoss class}}."
+            )
+        return {auxiliary: known[auxiliary]}
+    classes = dict(auxiliary) if isinstance(auxiliary, Mapping) else {"": auxiliary}
+    for name, loss in classes.items():
+        if not (name and isinstance(loss, type) and issubclass(loss, AuxiliaryLoss)):
+            raise ValueError(f"auxiliary={auxiliary!r}: expected 'deepmdp', None, or {{name: AuxiliaryLoss class}}.")
+    return classes
+
+
+def auxiliary_losses(modules: nn.ModuleDict, batch: LatentTransitions, terms: Container[str]) -> dict[str, th.Tensor]:
+    """
+    Those of the ``terms`` that the auxiliary losses of a policy know.
+
+    :param modules: the losses
+    :param batch: what they are computed of
+    :param terms: names of the wanted terms
+    :raises ValueError: if a loss does not return the terms that it announces
+    """
+    losses: dict[str, th.Tensor] = {}
+    for module in modules.values():
+        announced: tuple[str, ...] = module.terms  # type: ignore[assignment]
+        if any(term in terms for term in announced):
+            values: dict[str, th.Tensor] = module(batch)
+            if values.keys() != set(announced):
+                raise ValueError(
+                    f"{type(module).__name__}: forward returned the losses {sorted(values)}, but `terms` announces "
+                    f"{sorted(announced)}; make them the same."
+                )
+            losses.update(values)
+    return {term: loss for term, loss in losses.items() if term in terms}

@@ -254,3 +254,14 @@ class MultiModalCritic(BaseModel):
         """
         values = self.values(self.encoder(obs), actions)
         return {name: value for name, value in values._asdict().items() if value is not None}
+
+
+def drop_modalities(features: th.Tensor, probability: float) -> th.Tensor:
+    """Blanks each modality of each sample of features (B, d, F) with this probability, but never all of a sample."""
+    if probability == 0:
+        return features
+    batch_size, n_modalities, _ = features.shape
+    kept = th.rand(batch_size, n_modalities, device=features.device) >= probability
+    spared = th.randint(n_modalities, (batch_size, 1), device=features.device)
+    kept |= ~kept.any(dim=1, keepdim=True) & th.zeros_like(kept).scatter_(1, spared, True)
+    return features * kept.unsqueeze(2)

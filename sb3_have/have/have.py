@@ -1,5 +1,7 @@
 """HAVESAC: soft actor-critic with Hierarchical Adaptive Value Estimation."""
 
+import io
+import pathlib
 from collections.abc import Mapping
 from typing import Any, ClassVar, TypeVar
 
@@ -12,11 +14,13 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import polyak_update
 
-from sb3_have.have.auxiliary import AuxiliaryLoss, LatentTransitions
-from sb3_have.have.critic import MultiModalCritic, Values
+from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
+from sb3_have.have.auxiliary import AuxiliaryLoss, LatentTransitions, auxiliary_classes, auxiliary_losses
+from sb3_have.have.critic import MultiModalCritic, Values, drop_modalities
 from sb3_have.have.policies import MultiModalPolicy, check_observation, check_stored_observation
 
 SelfHAVESAC = TypeVar("SelfHAVESAC", bound="HAVESAC")
@@ -34,9 +38,13 @@ class HAVESAC(SAC):
 
     :param policy: "MultiInputPolicy" or a subclass of :class:`MultiModalPolicy`
     :param env: environment with Box actions and Dict (or Box) observations
+    :param replay_buffer_class: by default :class:`~sb3_have.ModalityReplayBuffer` for images and for n-step returns,
+        SB3's otherwise; it is told the number of frames that VecFrameStack stacks
+    :param n_steps: length of n-step returns, for Dict observations too; DeepMDP then predicts n steps ahead from one
+        action
     :param target_update_interval: updates between two target updates, counted over the whole training (SB3 counts them
         anew in every call of ``train``, so that there it does nothing with ``gradient_steps=1``)
-    :param n_steps: as in SB3, so not for Dict observations; DeepMDP then predicts n steps ahead from one action
+    :param policy_delay: updates of the critic for one of the actor and the entropy temperature, counted likewise
     :param value_estimation: which value acts: "have" (re-fusion of both), "lve" (weighted local values alone) or "gve"
         (global value alone), the paper's ablations
     :param refusion: form of the re-fusion network: "convex", "monotone" or "free" (the paper's), see
@@ -51,6 +59,8 @@ class HAVESAC(SAC):
         and actor alike, never all of them
     :param auxiliary: "deepmdp", None, or ``{name: AuxiliaryLoss class}`` ("deepmdp" included where wanted): the
         auxiliary losses that are trained, with coefficient 1 (see :class:`~sb3_have.DeepMDPCallback`)
+    :param compile: whether to compile encoders, critics and auxiliary heads by ``torch.nn.Module.compile``; worth it
+        on CUDA, and on a CPU only for long runs
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -81,6 +91,7 @@ class HAVESAC(SAC):
         n_steps: int = 1,
         ent_coef: str | float = "auto",
         target_update_interval: int = 1,
+        policy_delay: int = 1,
         target_entropy: str | float = "auto",
         use_sde: bool = False,
         sde_sample_freq: int = -1,
@@ -91,6 +102,7 @@ class HAVESAC(SAC):
         local_coef: float = 1.0,
         modality_dropout: float = 0.0,
         auxiliary: str | Mapping[str, type[AuxiliaryLoss]] | None = "deepmdp",
+        compile: bool = False,
         stats_window_size: int = 100,
         tensorboard_log: str | None = None,
         policy_kwargs: dict[str, Any] | None = None,
@@ -103,8 +115,8 @@ class HAVESAC(SAC):
         for name, value, default in [("value_estimation", value_estimation, "have"), ("refusion", refusion, "convex")]:
             if policy_kwargs.setdefault(name, value) != value and value != default:
                 raise ValueError(f"{name}={value!r}, but policy_kwargs has {policy_kwargs[name]!r}: give it once.")
-        losses = _auxiliary_classes(auxiliary)
         defaults = MultiModalPolicy.default_auxiliary_losses
+        losses = auxiliary_classes(auxiliary, defaults)
         own_losses = {name: loss for name, loss in losses.items() if defaults.get(name) is not loss}
         if own_losses:
             policy_kwargs["auxiliary_losses"] = {**policy_kwargs.get("auxiliary_losses", {}), **own_losses}
@@ -145,10 +157,13 @@ class HAVESAC(SAC):
             device=device,
             _init_setup_model=False,
         )
+        self.policy_delay = policy_delay
         self.target = target
         self.local_coef = local_coef
         self.modality_dropout = modality_dropout
         self.auxiliary_coefs = {term: 1.0 for loss in losses.values() for term in loss.terms}
+        self.compile = compile
+        self._last_losses: dict[str, th.Tensor] = {}
         if _init_setup_model:
             self._setup_model()
 
@@ -160,7 +175,26 @@ class HAVESAC(SAC):
             raise ValueError(f"local_coef={self.local_coef}: expected a number >= 0.")
         if not 0 <= self.modality_dropout < 1:
             raise ValueError(f"modality_dropout={self.modality_dropout}: expected a probability in [0, 1).")
+        for name in ("policy_delay", "target_update_interval"):
+            if not (isinstance(interval := getattr(self, name), int) and interval >= 1):
+                raise ValueError(f"{name}={interval!r}: expected a whole number of updates, from 1 on.")
+        given = self.n_steps, self.replay_buffer_kwargs
+        if self.replay_buffer_class is None and (self.n_steps > 1 or _has_images(self.observation_space)):
+            self.replay_buffer_class = ModalityReplayBuffer
+        if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, ModalityReplayBuffer):
+            n_stack = 1 if self.env is None else stacked_frames(self.env)
+            buffer_kwargs = {"n_stack": n_stack, "n_steps": self.n_steps, "gamma": self.gamma}
+            self.n_steps, self.replay_buffer_kwargs = (
+                1,
+                buffer_kwargs | self.replay_buffer_kwargs,
+            )  # SB3 refuses n_steps
         super()._setup_model()
+        self.n_steps, self.replay_buffer_kwargs = given
+        if self.compile:
+            for module in (*self.critic.children(), *self.critic_target.children(), *self.policy.auxiliary.values()):
+                module.compile()
+        if self.verbose >= 1:
+            print(f"Image encoders compute in {self.critic.encoder.image_dtype(self.device)}")
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         self.policy.set_training_mode(True)
@@ -183,23 +217,10 @@ class HAVESAC(SAC):
             features = self.policy.encode(replay_data.observations)
             with th.no_grad():
                 next_features = self.critic_target.encoder(replay_data.next_observations)
-            inputs = self._drop_modalities(features)
-            actor_inputs = inputs.detach()
-
-            # Entropy temperature (see SB3's SAC)
+            inputs = drop_modalities(features, self.modality_dropout)
             if self.use_sde:
                 self.actor.reset_noise()
-            actions_pi, log_prob = self.actor.action_log_prob(actor_inputs.flatten(start_dim=1))
-            if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
-                ent_coef = th.exp(self.log_ent_coef.detach())
-                ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
-                self.ent_coef_optimizer.zero_grad()
-                ent_coef_loss.backward()  # type: ignore[no-untyped-call]
-                self.ent_coef_optimizer.step()
-                logs.setdefault("ent_coef_loss", []).append(ent_coef_loss.detach())
-            else:
-                ent_coef = self.ent_coef_tensor
-            logs.setdefault("ent_coef", []).append(ent_coef)
+            ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
 
             # Critics, and the auxiliary losses on the same features: one backward pass, one optimizer
             with th.no_grad():
@@ -215,21 +236,32 @@ class HAVESAC(SAC):
                 features, replay_data.actions, replay_data.rewards, next_features, replay_data.dones
             )
             loss = critic_loss
-            for term, aux_loss in self._auxiliary_losses(batch).items():
+            for term, aux_loss in auxiliary_losses(self.policy.auxiliary, batch, self.auxiliary_coefs).items():
                 loss = loss + self.auxiliary_coefs[term] * aux_loss
                 logs.setdefault(f"aux_{term}_loss", []).append(aux_loss.detach())
             self.critic.optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             self.critic.optimizer.step()
 
-            # Actor (Eq. 11): minimum over the twins after mixing, gradients for the actor's parameters alone
-            min_q_pi = self.critic.values(actor_inputs, actions_pi).q.min(dim=0).values
-            actor_loss = (ent_coef * log_prob - min_q_pi).mean()
-            logs.setdefault("actor_loss", []).append(actor_loss.detach())
-            gradients = th.autograd.grad(actor_loss, actor_parameters, allow_unused=True)
-            for parameter, gradient in zip(actor_parameters, gradients, strict=True):
-                parameter.grad = gradient
-            self.actor.optimizer.step()
+            # Entropy temperature (see SB3's SAC), and actor (Eq. 11): minimum over the twins after mixing, gradients
+            # for the actor's parameters alone
+            if self._n_updates % self.policy_delay == 0:
+                actor_inputs = inputs.detach()
+                actions_pi, log_prob = self.actor.action_log_prob(actor_inputs.flatten(start_dim=1))
+                if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
+                    ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
+                    self.ent_coef_optimizer.zero_grad()
+                    ent_coef_loss.backward()  # type: ignore[no-untyped-call]
+                    self.ent_coef_optimizer.step()
+                    logs.setdefault("ent_coef_loss", []).append(ent_coef_loss.detach())
+                min_q_pi = self.critic.values(actor_inputs, actions_pi).q.min(dim=0).values
+                actor_loss = (ent_coef * log_prob - min_q_pi).mean()
+                gradients = th.autograd.grad(actor_loss, actor_parameters, allow_unused=True)
+                for parameter, gradient in zip(actor_parameters, gradients, strict=True):
+                    parameter.grad = gradient
+                self.actor.optimizer.step()
+                logs.setdefault("actor_loss", []).append(actor_loss.detach())
+                logs.setdefault("ent_coef", []).append(ent_coef)
 
             # Target networks: encoder, every critic, assignment and re-fusion
             if self._n_updates % self.target_update_interval == 0:
@@ -238,8 +270,19 @@ class HAVESAC(SAC):
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name, tensors in logs.items():
-            self.logger.record(f"train/{name}", th.stack(tensors).mean().item())
+        self._last_losses |= {name: th.stack(tensors).mean() for name, tensors in logs.items()}
+        if self.device.type == "cpu":
+            self._record_losses()
+
+    def dump_logs(self) -> None:
+        self._record_losses()
+        super().dump_logs()
+
+    def _record_losses(self) -> None:
+        """Reads the losses, for which a GPU has to finish its work: so not in every update there."""
+        for name, loss in self._last_losses.items():
+            self.logger.record(f"train/{name}", loss.item())
+        self._last_losses = {}
 
     def _target_values(
         self,
@@ -286,30 +329,18 @@ class HAVESAC(SAC):
             loss = loss + self.local_coef * sum(squared_error(part) for part in parts if part is not None)
         return loss
 
-    def _auxiliary_losses(self, batch: LatentTransitions) -> dict[str, th.Tensor]:
-        """The terms that are switched on, of every auxiliary loss that has one."""
-        terms: dict[str, th.Tensor] = {}
-        for loss in self.policy.auxiliary.values():
-            if any(term in self.auxiliary_coefs for term in loss.terms):  # type: ignore[union-attr]
-                losses: dict[str, th.Tensor] = loss(batch)
-                announced = set(loss.terms)  # type: ignore[arg-type]
-                if losses.keys() != announced:
-                    raise ValueError(
-                        f"{type(loss).__name__}: forward returned the losses {sorted(losses)}, but `terms` announces "
-                        f"{sorted(announced)}; make them the same."
-                    )
-                terms.update(losses)
-        return {term: value for term, value in terms.items() if term in self.auxiliary_coefs}
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        :param path: of the pickled replay buffer
+        :param truncate_last_traj: whether the last trajectory ends where the buffer was saved; False if the environment
+            goes on from there
+        """
+        super().load_replay_buffer(path, truncate_last_traj)
+        if truncate_last_traj and isinstance(self.replay_buffer, ModalityReplayBuffer):
+            self.replay_buffer.truncate_last_trajectory()
 
-    def _drop_modalities(self, features: th.Tensor) -> th.Tensor:
-        """Blanks each modality of each sample with probability ``modality_dropout``, but never all of a sample."""
-        if self.modality_dropout == 0:
-            return features
-        batch_size, n_modalities, _ = features.shape
-        kept = th.rand(batch_size, n_modalities, device=features.device) >= self.modality_dropout
-        spared = th.randint(n_modalities, (batch_size, 1), device=features.device)
-        kept |= ~kept.any(dim=1, keepdim=True) & th.zeros_like(kept).scatter_(1, spared, True)
-        return features * kept.unsqueeze(2)
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_last_losses"]
 
     def modality_weights(self, observation: np.ndarray | dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """
@@ -380,19 +411,5 @@ class HAVESAC(SAC):
         )
 
 
-def _auxiliary_classes(auxiliary: str | Mapping[str, type[AuxiliaryLoss]] | None) -> dict[str, type[AuxiliaryLoss]]:
-    """The losses that are switched on, by name."""
-    known = MultiModalPolicy.default_auxiliary_losses
-    if auxiliary is None:
-        return {}
-    if isinstance(auxiliary, str):
-        if auxiliary not in known:
-            raise ValueError(
-                f"auxiliary={auxiliary!r}: expected one of {list(known)}, None, or {{name: AuxiliaryLoss class}}."
-            )
-        return {auxiliary: known[auxiliary]}
-    classes = dict(auxiliary) if isinstance(auxiliary, Mapping) else {"": auxiliary}
-    for name, loss in classes.items():
-        if not (name and isinstance(loss, type) and issubclass(loss, AuxiliaryLoss)):
-            raise ValueError(f"auxiliary={auxiliary!r}: expected 'deepmdp', None, or {{name: AuxiliaryLoss class}}.")
-    return classes
+def _has_images(space: spaces.Space[Any]) -> bool:
+    return any(map(is_image_space, space.spaces.values() if isinstance(space, spaces.Dict) else [space]))
