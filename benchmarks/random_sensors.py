@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -69,7 +70,7 @@ def transitions(env: VecEnv, steps: int, seed: int = 0) -> Iterator[tuple[Any, .
         actions = rng.uniform(-1, 1, (env.num_envs, 2)).astype(np.float32)
         next_observations, rewards, dones, infos = env.step(actions)
         assert isinstance(next_observations, dict)
-        last = {key: values.copy() for key, values in next_observations.items()}
+        last = copy.deepcopy(next_observations)  # keeps the strides of the transposed view, as SB3's own does
         for index in np.flatnonzero(dones):
             for key, value in infos[index]["terminal_observation"].items():
                 last[key][index] = value

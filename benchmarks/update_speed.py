@@ -19,7 +19,8 @@ actor, temperature and target are updated. Rows, printed and written to benchmar
 Columns: median and quartiles of the wall-clock time; ``cpu_ms``, median processor time; ``vs_sb3`` and
 ``vs_sb3_shared``, how many times faster than SB3; ``vs_floor``, time over that of the encoders; ``share`` of HAVESAC's
 step. Ratios are medians over the rounds of the ratio within a round. On a GPU, ``gpu_share`` is the time of its kernels
-over the time of the step.
+over the time of the step. ``options`` are those of the command line that change what is measured. One of them,
+``--retain-memory``, lets the C library keep freed memory: at large images page faults cost every contender time.
 """
 
 from __future__ import annotations
@@ -40,7 +41,18 @@ from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 from stable_baselines3.common.vec_env import VecEnv
 from torch import nn
 
-from benchmarks.measure import RESULTS, Row, Times, interleave, machine, median_ratio, quartiles, save, show
+from benchmarks.measure import (
+    RESULTS,
+    Row,
+    Times,
+    interleave,
+    machine,
+    median_ratio,
+    quartiles,
+    retain_memory,
+    save,
+    show,
+)
 from benchmarks.random_sensors import CHANNELS, make_env, transitions
 from sb3_have import HAVESAC
 from sb3_have.common.encoders import MultiModalEncoder, default_layers
@@ -48,7 +60,7 @@ from sb3_have.common.encoders import MultiModalEncoder, default_layers
 FEATURES_DIM = 50
 NET_ARCH = [256, 256]
 BUFFER_SIZE = 500
-GROUP = ("device", "threads", "shape", "modalities")
+GROUP = ("device", "threads", "options", "shape", "modalities")
 RATIOS = ("vs_sb3", "vs_sb3_shared", "vs_floor", "share")
 COLUMNS = {"contender", "precision", "median_ms", "q25_ms", "q75_ms", "cpu_ms", *RATIOS, "updates_per_s", "gpu_share"}
 PARTS = ("encoders", "decoding", "sampling")
@@ -182,7 +194,7 @@ def on_decoded(encoder: MultiModalEncoder, observations: dict[str, th.Tensor]) -
 
     hooks = [module.register_forward_pre_hook(remember) for module in encoder.encoders]
     with th.no_grad():
-        encoder(observations)
+        encoder.forward(observations)  # not as compiled, which need not call the hooks
     for hook in hooks:
         hook.remove()
 
@@ -307,16 +319,25 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--skip-sb3", action="store_true")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--retain-memory", action="store_true", help="malloc keeps freed memory, for all contenders")
     parser.add_argument("--storage", help="of HAVESAC's replay buffer: memory, mmap or device")
     parser.add_argument("--compile", action="store_true", help="HAVESAC(compile=True)")
     parser.add_argument("--output", type=Path, default=RESULTS / "update_speed.csv")
     args = parser.parse_args(arguments)
     th.set_num_threads(args.threads)
-    kwargs: dict[str, Any] = {"compile": True} if args.compile else {}
+    kwargs: dict[str, Any] = {}
+    options = "default"
+    if args.compile:
+        kwargs["compile"] = True
+        options += " compile"
     if args.storage:
         kwargs["replay_buffer_kwargs"] = {"storage": args.storage}
+        options += f" storage={args.storage}"
+    if args.retain_memory:
+        retain_memory()
+        options += " retain-memory"
     about = machine(args.device)
-    print(*about.values(), f"{args.threads} thread(s)", sep="\n")
+    print(*about.values(), f"{args.threads} thread(s), options: {options}", sep="\n")
     rows: list[Row] = []
     for name in args.shapes:
         shape = SHAPES[name]
@@ -327,7 +348,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             keys = ", ".join(list(CHANNELS)[:modalities])
             print(f"\n({name}) {shape.image_size}x{shape.image_size} px, {keys}; batch {shape.batch_size}")
             show(measured, [column for column in measured[0] if column in COLUMNS])
-            rows += [{"shape": name, **row, **about} for row in measured]
+            rows += [{"shape": name, "options": options, **row, **about} for row in measured]
             save(rows, args.output, GROUP)
 
 
