@@ -48,6 +48,10 @@ class Ground:
     marking: Array  # share of the road that is painted; the rest is asphalt
     verge: Array  # brightness factor of the verge's patchwork
 
+    def last(self) -> Ground:
+        """The last instant alone."""
+        return Ground(self.road[-1:], self.marking[-1:], self.verge[-1:])
+
 
 @dataclass
 class Objects:
@@ -118,13 +122,15 @@ class Camera:
         line = np.clip(np.rint(lane), 0, self.lanes_count)
         distance = np.abs(lane - line) * np.float32(self.lane_width)
         marking = np.clip((LINE_WIDTH / 2 + wide / 2 - distance) / wide, 0, np.minimum(1, LINE_WIDTH / wide))
-        dashes = (_painted_length(along + long / 2) - _painted_length(along - long / 2)) / long
-        marking *= np.where((line > 0) & (line < self.lanes_count), dashes, np.float32(1))
+        dashed = np.nonzero((marking != 0) & (line > 0) & (line < self.lanes_count))
+        middle, half = along[dashed], (long / 2)[dashed[1], 0]
+        marking[dashed] *= (_painted_length(middle + half) - _painted_length(middle - half)) / long[dashed[1], 0]
 
         beyond = np.abs(across - np.float32(self.roadside.middle)) - np.float32(self.roadside.half_width)
         road = np.clip(np.float32(0.5) - beyond / wide, 0, 1)
         # Patches of 1 m average out where they are smaller than a pixel.
-        patches = self._patchwork[np.floor(along).astype(np.int32) & 63, np.floor(across).astype(np.int32) & 63]
+        patch = (np.floor(along).astype(np.int32) & 63) * 64 + (np.floor(across).astype(np.int32) & 63)
+        patches = self._patchwork.take(patch)
         verge = 1 + (patches - 1) * np.minimum(1, 2 / np.maximum(wide, long))
         return Ground(road, marking, verge)
 
@@ -137,21 +143,24 @@ class Camera:
         """
         faces = self._project(poses, sizes)
         painted = self._paint(len(poses), faces).reshape(-1)
-        sample = np.flatnonzero(painted)
-        face = painted[sample].astype(np.int64) - 1
-        instant, sample = np.divmod(sample, (SUPERSAMPLING * self.size) ** 2)
-        row, column = np.divmod(sample, SUPERSAMPLING * self.size)
-        pixel = (instant * self.size + row // SUPERSAMPLING) * self.size + column // SUPERSAMPLING
+        sample = np.flatnonzero(painted != 0)
+        face = painted[sample] - 1
+        # Line: row of the images stacked. (numpy divides by a constant much faster than it takes a remainder.)
+        line = sample.astype(np.int32) // (SUPERSAMPLING * self.size)
+        column = sample - SUPERSAMPLING * self.size * line
+        pixel = line // SUPERSAMPLING * self.size + column // SUPERSAMPLING
 
         # Inverse depth, and s over depth, are linear along an image row.
-        u0, per_pixel, inverse, inverse_change, s, s_change, bottom, cells = faces.plane[face].T
+        u0, per_pixel, inverse, inverse_change, s, s_change, s_max, bottom, cells = faces.plane.take(face, axis=1)
         q = np.clip((self._sample_u[column] - u0) * per_pixel, 0, 1)
         depth = 1 / (inverse + q * inverse_change)
-        cell_s = np.floor(TEXTURE_COLUMNS * np.minimum((s + q * s_change) * depth, faces.s_max[face]))
-        z = np.float32(self.height) - self._sample_slope[row] * depth
-        cell_z = np.clip((z - bottom) * cells, 0, TEXTURE_ROWS - 1)
-        material = TEXTURES[faces.kind[face], cell_z.astype(np.int64), cell_s.astype(np.int64) % TEXTURE_COLUMNS]
-        material = np.where(material == BODY, BODY + faces.vehicle[face], material)
+        cell_s = np.floor(TEXTURE_COLUMNS * np.minimum((s + q * s_change) * depth, s_max)).astype(np.int32)
+        z = np.float32(self.height) - np.tile(self._sample_slope, len(poses))[line] * depth
+        cell_z = np.clip((z - bottom) * cells, 0, TEXTURE_ROWS - 1).astype(np.int32)
+        cell = (faces.kind[face] * TEXTURE_ROWS + cell_z) * TEXTURE_COLUMNS + cell_s % TEXTURE_COLUMNS
+        material = TEXTURES.take(cell)
+        body = np.flatnonzero(material == BODY)
+        material[body] += faces.vehicle[face[body]]
         return Objects(pixel, depth, material, face, faces.normal, faces.vehicle)
 
     def depth(self, objects: Objects) -> Array:
@@ -204,14 +213,14 @@ class Camera:
         tip = np.where(faces.kind == TREE, 0.5, 0.0) * (u1 - u0)
         u = np.stack((u0, u1, u1 - tip, u0 + tip), axis=-1)
         s0, s1 = s_start * inverse0, s_end * inverse1
-        plane = np.empty((len(u0), 8), dtype=np.float32)
-        plane[:, 0], plane[:, 1] = u0, 1 / np.maximum(u1 - u0, 1e-6)
-        plane[:, 2], plane[:, 3] = inverse0, inverse1 - inverse0
-        plane[:, 4], plane[:, 5] = s0, s1 - s0
-        plane[:, 6], plane[:, 7] = faces.bottom, TEXTURE_ROWS / (faces.top - faces.bottom)
         # Just under the end of the texture, so that a sample on a face's edge falls into the last cell.
-        s_max = (np.maximum(faces.s_start, faces.s_end) - 1e-4).astype(np.float32)
-        return _Projected(instant, np.stack((u, v), axis=-1), plane, s_max, faces.kind, faces.normal, faces.vehicle)
+        s_max = np.maximum(faces.s_start, faces.s_end) - 1e-4
+        cells = TEXTURE_ROWS / (faces.top - faces.bottom)
+        per_pixel = 1 / np.maximum(u1 - u0, 1e-6)
+        plane = np.array(
+            (u0, per_pixel, inverse0, inverse1 - inverse0, s0, s1 - s0, s_max, faces.bottom, cells), dtype=np.float32
+        )
+        return _Projected(instant, np.stack((u, v), axis=-1), plane, faces.kind, faces.normal, faces.vehicle)
 
     def _paint(self, instants: int, faces: _Projected) -> NDArray[np.int32]:
         """Number of the face (from 1) that each sample sees, (instants, rows, columns) of samples; 0 for none."""
@@ -232,10 +241,8 @@ class _Projected:
 
     instant: IntArray
     corners: Array  # (faces, 4, 2): u, v of bottom left, bottom right, top right, top left
-    plane: NDArray[
-        np.float32
-    ]  # (faces, 8): u0, 1 / width, 1 / depth, its change, s / depth, its change, bottom, cells / m
-    s_max: NDArray[np.float32]
+    #: (9, faces): u0, 1 / width, 1 / depth, its change, s / depth, its change, largest s, bottom, cells / m
+    plane: NDArray[np.float32]
     kind: IntArray
     normal: Array
     vehicle: IntArray

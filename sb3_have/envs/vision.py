@@ -184,11 +184,12 @@ class VisionSensors:
         # A generator each, always drawn: the noise of one sensor does not depend on which others there are.
         picture_rng, event_rng = (np.random.default_rng(seed) for seed in rng.integers(2**63, size=2))
         observation: Observation = {}
-        if "rgb" in self.modalities:
-            ground = self.camera.ground(poses[-1:])
-            observation["rgb"] = take_picture(self._colour.render(ground, last)[0], self.weather, picture_rng)
-        if "event" in self.modalities:
+        if "rgb" in self.modalities or "event" in self.modalities:
             ground = self.camera.ground(poses)
+        if "rgb" in self.modalities:
+            picture = self._colour.render(ground.last(), last)[0]
+            observation["rgb"] = take_picture(picture, self.weather, picture_rng)
+        if "event" in self.modalities:
             observation["event"] = self._events(self._brightness.render(ground, objects)[..., 0], duration, event_rng)
         if "depth" in self.modalities:
             depth = self.camera.depth(last)
