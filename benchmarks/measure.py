@@ -117,7 +117,7 @@ def save(rows: Sequence[Row], path: Path, group: Sequence[str]) -> None:
     if path.exists():
         old = pd.read_csv(path)
         measured = set(map(tuple, new[list(group)].astype(str).to_numpy()))
-        kept = [tuple(values) not in measured for values in old[list(group)].astype(str).to_numpy()]
+        kept = [tuple(values) not in measured for values in old.reindex(columns=list(group)).astype(str).to_numpy()]
         if any(kept):
             new = pd.concat([old[kept], new])
     path.parent.mkdir(parents=True, exist_ok=True)

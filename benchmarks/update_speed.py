@@ -31,6 +31,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import torch as th
 from gymnasium import spaces
@@ -325,6 +326,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--output", type=Path, default=RESULTS / "update_speed.csv")
     args = parser.parse_args(arguments)
     th.set_num_threads(args.threads)
+    cv2.setNumThreads(args.threads)  # decodes HAVESAC's images
     kwargs: dict[str, Any] = {}
     options = "default"
     if args.compile:
