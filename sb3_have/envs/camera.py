@@ -121,10 +121,12 @@ class Camera:
         lane = across / np.float32(self.lane_width) + np.float32(0.5)
         line = np.clip(np.rint(lane), 0, self.lanes_count)
         distance = np.abs(lane - line) * np.float32(self.lane_width)
-        marking = np.clip((LINE_WIDTH / 2 + wide / 2 - distance) / wide, 0, np.minimum(1, LINE_WIDTH / wide))
-        dashed = np.nonzero((marking != 0) & (line > 0) & (line < self.lanes_count))
-        middle, half = along[dashed], (long / 2)[dashed[1], 0]
-        marking[dashed] *= (_painted_length(middle + half) - _painted_length(middle - half)) / long[dashed[1], 0]
+        marking = np.maximum((LINE_WIDTH / 2 + wide / 2 - distance) / wide, 0)
+        marking = np.minimum(marking, np.minimum(1, LINE_WIDTH / wide))
+        dashed = np.flatnonzero((marking != 0) & (line > 0) & (line < self.lanes_count))
+        middle, length = along.take(dashed), long[dashed // self.size % len(long), 0]
+        paint = _painted_length(middle + length / 2) - _painted_length(middle - length / 2)
+        marking.reshape(-1)[dashed] *= paint / length
 
         beyond = np.abs(across - np.float32(self.roadside.middle)) - np.float32(self.roadside.half_width)
         road = np.clip(np.float32(0.5) - beyond / wide, 0, 1)
@@ -144,7 +146,7 @@ class Camera:
         faces = self._project(poses, sizes)
         painted = self._paint(len(poses), faces).reshape(-1)
         sample = np.flatnonzero(painted != 0)
-        face = painted[sample] - 1
+        face = painted[sample].astype(np.int64) - 1
         # Line: row of the images stacked. (numpy divides by a constant much faster than it takes a remainder.)
         line = sample.astype(np.int32) // (SUPERSAMPLING * self.size)
         column = sample - SUPERSAMPLING * self.size * line
@@ -157,7 +159,7 @@ class Camera:
         cell_s = np.floor(TEXTURE_COLUMNS * np.minimum((s + q * s_change) * depth, s_max)).astype(np.int32)
         z = np.float32(self.height) - np.tile(self._sample_slope, len(poses))[line] * depth
         cell_z = np.clip((z - bottom) * cells, 0, TEXTURE_ROWS - 1).astype(np.int32)
-        cell = (faces.kind[face] * TEXTURE_ROWS + cell_z) * TEXTURE_COLUMNS + cell_s % TEXTURE_COLUMNS
+        cell = (faces.kind.take(face) * TEXTURE_ROWS + cell_z) * TEXTURE_COLUMNS + cell_s % TEXTURE_COLUMNS
         material = TEXTURES.take(cell)
         body = np.flatnonzero(material == BODY)
         material[body] += faces.vehicle[face[body]]
@@ -198,7 +200,8 @@ class Camera:
         seen = start[..., 0] * end[..., 1] > start[..., 1] * end[..., 0]
         seen &= np.maximum(start[..., 0], end[..., 0]) > 2 * NEAR
         # A vehicle is shown at the instants at which it is in view; number -1, the roadside, at all.
-        seen &= np.take_along_axis(np.pad(in_view, ((0, 0), (0, 1)), constant_values=True), faces.vehicle, axis=1)
+        every = np.arange(len(poses))[:, None]
+        seen &= np.concatenate((in_view, every >= 0), axis=1)[every, faces.vehicle]
         instant = np.nonzero(seen)[0]
         start, end = start[seen], end[seen]
         faces = Faces(*(getattr(faces, field.name)[seen] for field in fields(Faces)))

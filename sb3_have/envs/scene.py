@@ -175,7 +175,7 @@ def vehicle_faces(poses: Array, sizes: Array, order: IntArray) -> Faces:
     :param sizes: (vehicles, 2): length, width.
     :param order: (instants, shown): the vehicles to show at each instant, far to near.
     """
-    pose, half = np.take_along_axis(poses, order[..., None], axis=1), 0.5 * sizes[order]
+    pose, half = poses[np.arange(len(poses))[:, None], order], 0.5 * sizes[order]
     ahead = np.stack((np.cos(pose[..., 2]), np.sin(pose[..., 2])), axis=-1)
     aside = np.stack((-ahead[..., 1], ahead[..., 0]), axis=-1)
     length, width, middle = half[..., :1] * ahead, half[..., 1:] * aside, pose[..., :2]

@@ -229,7 +229,7 @@ class Illumination:
         for channel, shade in zip(image.reshape(len(image), -1), self._shade(objects), strict=True):
             total = np.bincount(objects.pixel, weights=shade, minlength=len(channel))
             channel[hit] = channel[hit] * uncovered + total[hit].astype(np.float32) * share
-        return np.ascontiguousarray(np.moveaxis(image, 0, -1))
+        return np.stack(tuple(image), axis=-1)
 
     def _shade(self, objects: Objects) -> Array:
         """Radiance of the object samples, (channels, samples)."""
@@ -238,11 +238,12 @@ class Illumination:
         haze = np.exp(-np.float32(self.weather.extinction) * objects.depth)
         received = light.take(objects.face, axis=1)
         if self.weather.night:
-            tangent = self.camera.slope[objects.pixel % self.camera.size]
+            column = objects.pixel - self.camera.size * (objects.pixel // self.camera.size)
+            tangent = self.camera.slope[column]
             received += self._beam(objects.depth, tangent) * self.beam
         radiance = self.albedo.take(objects.material, axis=1) * received
         if self.weather.night:
-            radiance[:, objects.material == LAMP] += self.tail
+            radiance[:, np.flatnonzero(objects.material == LAMP)] += self.tail
         return np.asarray(radiance * haze + self.horizon * (1 - haze))
 
 
@@ -265,9 +266,9 @@ def take_picture(radiance: Array, weather: Weather, rng: np.random.Generator) ->
     """
     if weather.rain:
         streaks = _streaks(radiance.shape[0], weather, rng)
-        wet = np.nonzero(streaks)
+        wet = np.flatnonzero(streaks != 0)
         brightness, radiance = radiance.mean(axis=(0, 1)), radiance.copy()
-        radiance[wet] += streaks[wet][:, None] * brightness
+        radiance.reshape(-1, 3)[wet] += streaks.take(wet)[:, None] * brightness
     electrons = radiance * np.float32(weather.exposure * FULL_WELL)
     noise = rng.standard_normal(electrons.shape, dtype=np.float32)
     electrons += noise * np.sqrt(electrons + np.float32(READ_NOISE**2))
