@@ -1,61 +1,131 @@
-"""Control steps per second of HighwayVision-v0 on one core.
+"""Control steps per second of HighwayVision-v0 on one core, beside highway-env without any rendering.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.env_speed --sizes 64 84 128
+    OMP_NUM_THREADS=1 python -m benchmarks.env_speed
 
-Both wall-clock and processor time are given: on a machine with other work only the second says what a core can do.
+20 vehicles, the ego keeps straight at about 15 m/s; a step is 0.1 s or, as by default, 0.2 s of simulation at 20 Hz.
+The contenders take turns in one process; those with the same traffic drive through the very same one, see
+``benchmarks/road_identity.py``. Episodes end and begin anew within the time that is measured. Rows, printed and written
+to benchmarks/results/env_speed.csv:
+
+- ``HighwayVision-v0``: for image sizes, weathers and modalities;
+- ``no sensors``: its dynamics alone; ``stock road, no sensors``: the same on highway-env's own road, with its drivers;
+- ``highway-v0``: highway-env's environment with continuous actions and its default observation, 5 vehicles in numbers.
+
+Columns: median and quartiles of the wall-clock time of a step; ``cpu_ms``, median processor time, which says more on a
+machine with other work; ``steps_per_s`` and ``cpu_steps_per_s`` from these medians; ``vs_stock``, how many times faster
+than ``stock road, no sensors``, the median over the rounds of the ratio within a round, in processor time.
 """
 
 from __future__ import annotations
 
 import argparse
-import platform
-import time
+from collections.abc import Sequence
 from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
+import gymnasium as gym
+import highway_env  # noqa: F401 (registers highway-v0)
 import numpy as np
+import torch as th
 
+from benchmarks.measure import RESULTS, Row, interleave, machine, median_ratio, quartiles, save, show
+from benchmarks.road_identity import BlindEnv, StockEnv
 from sb3_have.envs import HighwayVisionEnv
+from sb3_have.envs.weather import WEATHERS
 
-SUBSETS: list[tuple[str, ...]] = [("rgb", "event", "depth"), ("rgb",), ("event",), ("depth",)]
+SPEED = 15.0
+ALL = ("rgb", "event", "depth")
+COLUMNS = (
+    *("contender", "image_size", "weather", "modalities", "median_ms", "q25_ms", "q75_ms", "cpu_ms"),
+    *("steps_per_s", "cpu_steps_per_s", "vs_stock"),
+)
 
 
-def measure(env: HighwayVisionEnv, chunks: int, steps: int) -> tuple[float, float]:
-    """Median steps per second over chunks, by wall clock and by processor time, keeping straight at about 15 m/s."""
-    env.reset(seed=0)
-    wall, cpu = [], []
-    for chunk in range(chunks + 1):
-        start = time.perf_counter(), time.process_time()
-        for _ in range(steps):
-            throttle = np.clip((15 - env.vehicle.speed) / 3, -1, 1)
-            *_, terminated, truncated, _ = env.step(np.array([throttle, 0.0]))
-            if terminated or truncated:
-                env.reset()
-        if chunk:  # the first one warms up
-            wall.append(steps / (time.perf_counter() - start[0]))
-            cpu.append(steps / (time.process_time() - start[1]))
-    return float(np.median(wall)), float(np.median(cpu))
+class Contender(NamedTuple):
+    """What is timed; the last three only where there are sensors."""
+
+    contender: str
+    image_size: int | None = None
+    weather: str = ""
+    modalities: tuple[str, ...] = ()
+
+
+STOCK = Contender("stock road, no sensors")
+
+
+def make_env(contender: Contender, control_frequency: int, vehicles: int) -> gym.Env[Any, Any]:
+    """The contender's environment."""
+    frequencies = {"simulation_frequency": 20, "policy_frequency": control_frequency}
+    if contender.contender == "highway-v0":
+        config = {"action": {"type": "ContinuousAction"}, "lanes_count": 4, "vehicles_count": vehicles, **frequencies}
+        return gym.make("highway-v0", config=config)
+    kwargs: dict[str, Any] = {"vehicles_count": vehicles, **frequencies}
+    if contender == STOCK:
+        return StockEnv(**kwargs)
+    if contender.image_size is None:
+        return BlindEnv(**kwargs)
+    return HighwayVisionEnv(contender.weather, contender.modalities, contender.image_size, **kwargs)
+
+
+class Driver:
+    """Keeps straight; a call is one control step."""
+
+    def __init__(self, env: gym.Env[Any, Any]) -> None:
+        self.env = env
+        self.vehicle_of: Any = env.unwrapped
+        env.reset(seed=0)
+
+    def __call__(self) -> None:
+        throttle = min(max((SPEED - self.vehicle_of.vehicle.speed) / 3, -1), 1)
+        *_, terminated, truncated, _ = self.env.step(np.array([throttle, 0.0]))
+        if terminated or truncated:
+            self.env.reset()
+
+
+def measure(contenders: Sequence[Contender], control_frequency: int, args: argparse.Namespace) -> list[Row]:
+    """Rows of all contenders at one control frequency."""
+    drivers = {contender: Driver(make_env(contender, control_frequency, args.vehicles)) for contender in contenders}
+    times = interleave(drivers, args.rounds, args.steps)
+    where = machine()
+    packages = ", ".join(f"{name} {version(name)}" for name in ("highway-env", "opencv-python-headless"))
+    rows = []
+    for contender, (wall, cpu) in times.items():
+        cpu_ms = float(np.median(cpu))
+        row = {"threads": 1, "vehicles": args.vehicles, "control_hz": control_frequency, **contender._asdict()}
+        row |= {"image_size": contender.image_size or "", "modalities": "+".join(contender.modalities)}
+        row |= {**quartiles(wall), "cpu_ms": round(cpu_ms, 3)}
+        row |= {"steps_per_s": round(1e3 / float(np.median(wall)), 1), "cpu_steps_per_s": round(1e3 / cpu_ms, 1)}
+        row |= {"vs_stock": round(median_ratio(times[STOCK].cpu, cpu), 2)}
+        rows.append({**row, "rounds": args.rounds, "steps": args.steps, **where})
+        rows[-1]["versions"] += f", {packages}"
+    return rows
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", nargs="+", type=int, default=[64, 84, 128])
+    parser.add_argument("--weathers", nargs="+", choices=WEATHERS, default=["ClearNoon", "HardRainNight"])
+    parser.add_argument("--control", nargs="+", type=int, default=[10, 5], help="control frequencies [Hz]")
     parser.add_argument("--vehicles", type=int, default=20)
-    parser.add_argument("--weathers", nargs="+", default=["ClearNoon", "HardRainNight"])
-    parser.add_argument("--chunks", type=int, default=10)
-    parser.add_argument("--steps", type=int, default=50, help="control steps per chunk")
+    parser.add_argument("--rounds", type=int, default=30)
+    parser.add_argument("--steps", type=int, default=25, help="control steps of each contender in each round")
+    parser.add_argument("--out", type=Path, default=RESULTS / "env_speed.csv")
     args = parser.parse_args()
     cv2.setNumThreads(1)
-    packages = ", ".join(f"{name} {version(name)}" for name in ("highway-env", "numpy", "opencv-python-headless"))
-    print(f"Python {platform.python_version()}, {packages}, {platform.machine()}")
-    print(f"{args.vehicles} vehicles, 5 Hz control, 20 Hz simulation; median of {args.chunks} x {args.steps} steps")
-    print(f"{'size':>5} {'weather':14} {'modalities':16} {'steps/s wall':>13} {'steps/s CPU':>12}")
-    for size in args.sizes:
-        for weather in args.weathers:
-            for modalities in SUBSETS:
-                env = HighwayVisionEnv(weather, modalities, size, vehicles_count=args.vehicles)
-                wall, cpu = measure(env, args.chunks, args.steps)
-                print(f"{size:5d} {weather:14} {'+'.join(modalities):16} {wall:13.0f} {cpu:12.0f}", flush=True)
+    th.set_num_threads(1)
+    contenders = [STOCK, Contender("no sensors"), Contender("highway-v0")]
+    contenders += [
+        Contender("HighwayVision-v0", size, weather, ALL) for size in args.sizes for weather in args.weathers
+    ]
+    contenders += [Contender("HighwayVision-v0", 84, "ClearNoon", (name,)) for name in ALL]
+    for control_frequency in args.control:
+        rows = measure(contenders, control_frequency, args)
+        save(rows, args.out, ("vehicles", "control_hz"))
+        print(f"{control_frequency} Hz control over 20 Hz simulation, {args.rounds} x {args.steps} steps")
+        show(rows, COLUMNS)
+    print(rows[0]["machine"], rows[0]["versions"], sep="\n")
 
 
 if __name__ == "__main__":
