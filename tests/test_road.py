@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from highway_env.vehicle.behavior import IDMVehicle
 
+from benchmarks import env_speed
 from benchmarks.road_identity import KINDS, BlindEnv, StockEnv, compare
 from sb3_have.envs.driver import Driver
 from sb3_have.envs.road import HighwayRoad
@@ -47,3 +48,16 @@ def test_the_comparison_notices_a_fault(monkeypatch: pytest.MonkeyPatch, owner: 
     with pytest.raises(AssertionError, match="differ"):
         for seed in range(2):
             compare("breakdowns", seed, 120)
+
+
+def test_contenders_of_the_speed_benchmark_drive_through_the_same_traffic() -> None:
+    sensors = env_speed.Contender("HighwayVision-v0", 36, "WetNoon", ("depth",))
+    paths = []
+    for contender in (env_speed.STOCK, env_speed.Contender("no sensors"), sensors):
+        drive = env_speed.Driver(env_speed.make_env(contender, 10, vehicles=10))
+        for _ in range(20):
+            drive()
+        env: Any = drive.env.unwrapped
+        paths.append([(*v.position.tolist(), v.speed) for v in env.road.vehicles])
+    assert len(paths[0]) == 11 and paths[0] == paths[1] == paths[2]
+    assert paths[0][0][2] > 5

@@ -123,6 +123,7 @@ class Camera:
         distance = np.abs(lane - line) * np.float32(self.lane_width)
         marking = np.maximum((LINE_WIDTH / 2 + wide / 2 - distance) / wide, 0)
         marking = np.minimum(marking, np.minimum(1, LINE_WIDTH / wide))
+        # Lines between lanes are dashed: less paint, by the share of the pixel's length that dashes cover.
         dashed = np.flatnonzero((marking != 0) & (line > 0) & (line < self.lanes_count))
         middle, length = along.take(dashed), long[dashed // self.size % len(long), 0]
         paint = _painted_length(middle + length / 2) - _painted_length(middle - length / 2)
