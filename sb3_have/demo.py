@@ -22,6 +22,7 @@ from stable_baselines3.common.monitor import load_results
 
 from sb3_have.common.drivers import KeepStraightDriver, RandomDriver
 from sb3_have.common.evaluation import Predictor, evaluate, format_table
+from sb3_have.common.memory import keep_freed_memory
 from sb3_have.common.plotting import plot_learning_curve, plot_modality_weights, write_gif
 from sb3_have.common.recording import record_episode
 from sb3_have.envs.weather import WEATHERS
@@ -128,4 +129,5 @@ def phase(title: str) -> Iterator[None]:
 
 
 if __name__ == "__main__":
+    keep_freed_memory()
     main()

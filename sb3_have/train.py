@@ -36,6 +36,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 import sb3_have
 from sb3_have.common.evaluation import evaluate, leave_interrupts_to_parent
+from sb3_have.common.memory import keep_freed_memory
 from sb3_have.envs.weather import WEATHERS
 
 EVALUATION_SEED = 1_000_000
@@ -338,12 +339,31 @@ def _write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
     partial.replace(path)
 
 
+def hyperparameter(text: str) -> tuple[str, Any]:
+    """Name and value of ``name:value``, the value in YAML; 1e-3 is a number here, which in YAML it is not."""
+    name, separator, value = text.partition(":")
+    if not separator:
+        raise argparse.ArgumentTypeError(f"expected NAME:VALUE, got {text!r}")
+    try:
+        return name, float(value) if "e" in value.lower() else yaml.safe_load(value)
+    except ValueError:
+        return name, yaml.safe_load(value)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Command line of ``python -m sb3_have.train``."""
     parser = argparse.ArgumentParser(prog="python -m sb3_have.train", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--config", default="havesac", help="YAML file, or the name of one in zoo_configs")
     parser.add_argument("--algo", default="havesac", choices=["havesac", "sac"])
     parser.add_argument("--env", default="HighwayVision-v0", help="environment id")
+    parser.add_argument(
+        "--hyperparams",
+        nargs="+",
+        default=[],
+        type=hyperparameter,
+        metavar="NAME:VALUE",
+        help='in the configuration\'s place, in YAML: gamma:0.99 "policy_kwargs:{precision: float32}"',
+    )
     parser.add_argument("--steps", type=int, help="in all; default: n_timesteps of the configuration")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True, help="folder of the run; the same folder resumes it")
@@ -356,7 +376,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--progress-bar", action="store_true")
     args = parser.parse_args(arguments)
 
-    config = load_config(args.config, args.env)
+    config = load_config(args.config, args.env) | dict(args.hyperparams)
     run = Run(
         config,
         args.env,
@@ -375,4 +395,5 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
+    keep_freed_memory()
     main()

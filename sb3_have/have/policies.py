@@ -1,21 +1,25 @@
 """MultiModalPolicy: encoder, actor, MultiModalCritic, its target, and the heads of the auxiliary losses."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor, get_actor_critic_arch
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 from stable_baselines3.sac.policies import Actor, SACPolicy
 from torch import nn
+from torch.distributions import Normal
 
 from sb3_have.common.encoders import MultiModalEncoder
 from sb3_have.have.auxiliary import AuxiliaryLoss
 from sb3_have.have.critic import MultiModalCritic
 from sb3_have.have.deepmdp import DeepMDP
+
+SelfGaussian = TypeVar("SelfGaussian", bound="SquashedGaussian")
 
 
 class MultiModalPolicy(SACPolicy):
@@ -162,9 +166,10 @@ class MultiModalPolicy(SACPolicy):
         features_dim = len(self.critic.encoder.modalities) * self.critic.encoder.features_dim
         latent_space = spaces.Box(-np.inf, np.inf, (features_dim,), np.float32)
         actor_kwargs: dict[str, Any] = {**self.actor_kwargs, "observation_space": latent_space}
-        return Actor(features_extractor=FlattenExtractor(latent_space), features_dim=features_dim, **actor_kwargs).to(
-            self.device
-        )
+        actor = Actor(features_extractor=FlattenExtractor(latent_space), features_dim=features_dim, **actor_kwargs)
+        if not actor.use_sde:
+            actor.action_dist = SquashedGaussian(get_action_dim(self.action_space))  # type: ignore[assignment]
+        return actor.to(self.device)
 
     def encode(self, obs: PyTorchObs) -> th.Tensor:
         """Features (B, d, F) of raw observations (as tensors, with batch dimension)."""
@@ -186,6 +191,15 @@ class MultiModalPolicy(SACPolicy):
         del data["features_extractor_class"], data["features_extractor_kwargs"]
         data.update(**self.encoder_kwargs, **self.value_kwargs, auxiliary_losses=self.auxiliary_losses)
         return data
+
+
+class SquashedGaussian(SquashedDiagGaussianDistribution):
+    """SB3's, without torch's check for NaN on a GPU: the host would have to wait for it in every step."""
+
+    def proba_distribution(self: SelfGaussian, mean_actions: th.Tensor, log_std: th.Tensor) -> SelfGaussian:
+        validate_args = None if mean_actions.device.type == "cpu" else False
+        self.distribution = Normal(mean_actions, log_std.exp(), validate_args=validate_args)
+        return self
 
 
 def check_observation(observation: np.ndarray | dict[str, np.ndarray], space: spaces.Space[Any]) -> None:
