@@ -92,7 +92,7 @@ class ModalityReplayBuffer(ReplayBuffer):
                 frame_shapes[key] = (shape[0] // n_stack, *shape[1:])
                 self.stacked_keys.append(key)
 
-        n_slots = 1 + self.n_envs * (self.buffer_size + self.buffer_size // 16 + n_stack + 1)
+        n_slots = 1 + self.n_envs * (self.buffer_size + self.buffer_size // 32 + n_stack + 1)
         self.pool = FramePool(n_slots, frame_shapes, dtypes, storage, self.device, mmap_dir)
         self.slots = np.full((self.buffer_size, self.n_envs, 2, n_stack), EMPTY, np.int32)  # of obs and next_obs
         self.continues = np.zeros((self.buffer_size, self.n_envs), bool)  # obs is the last next_obs
@@ -135,7 +135,7 @@ class ModalityReplayBuffer(ReplayBuffer):
             self.slots[self.pos, env] = slots, next_slots
             # a slot that the next older transition does not use is used by none: stacks only move forward
             self.pool.give_back(old - set(self.slots[successor, env].ravel().tolist()) - {EMPTY})
-        self._last_next = {key: value.copy() for key, value in next_stacks.items()}
+        self._last_next = {key: value.copy(order="K") for key, value in next_stacks.items()}
 
         self.actions[self.pos] = np.reshape(action, (self.n_envs, self.action_dim))
         self.rewards[self.pos] = reward

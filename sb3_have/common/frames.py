@@ -85,12 +85,9 @@ class FramePool:
     def gather(self, key: str, slots: np.ndarray, pin_memory: bool = False) -> th.Tensor:
         """Copies of the frames of ``key`` in these slots, (n,) to (n, *shape); in pinned memory where asked for."""
         frames = self.frames[key]
-        out = th.empty(
-            (len(slots), *frames.shape[1:]),
-            dtype=frames.dtype,
-            device=frames.device,
-            pin_memory=pin_memory and frames.device.type == "cpu",
-        )
+        out = self._empty(key, len(slots))
+        if pin_memory and out.device.type == "cpu":
+            out = th.empty(out.shape, dtype=out.dtype, pin_memory=True)
         return th.index_select(frames, 0, th.from_numpy(slots).to(frames.device), out=out)
 
     def to(self, device: th.device) -> None:
@@ -126,20 +123,23 @@ class FramePool:
         for key, shape in self.shapes.items():
             if self.storage == "mmap":
                 self.frames[key] = self._map(key, (capacity, *shape))
-            else:
-                # not zeros: what is never written must cost no memory
-                dtype = th.from_numpy(np.empty(0, self.dtypes[key])).dtype
-                try:
-                    larger = th.empty((capacity, *shape), dtype=dtype, device=self.device)
-                except RuntimeError as error:
-                    raise MemoryError(
-                        f"No memory on {self.device} for {capacity} frames {shape} of {key!r}: lower `buffer_size`, or "
-                        'use `replay_buffer_kwargs=dict(storage="mmap")`.'
-                    ) from error
-                if self._n_touched:
-                    larger[: self._n_touched] = self.frames[key][: self._n_touched]
-                self.frames[key] = larger
+                continue
+            try:
+                larger = self._empty(key, capacity)
+            except (MemoryError, RuntimeError) as error:
+                raise MemoryError(
+                    f"No memory on {self.device} for {capacity} frames {shape} of {key!r}: lower `buffer_size`, or "
+                    'use `replay_buffer_kwargs=dict(storage="mmap")`.'
+                ) from error
+            if self._n_touched:
+                larger[: self._n_touched] = self.frames[key][: self._n_touched]
+            self.frames[key] = larger
         self._capacity = capacity
+
+    def _empty(self, key: str, n_frames: int) -> th.Tensor:
+        """Room for frames, which takes no memory until they are written; NumPy's comes in huge pages, PyTorch's not."""
+        empty = th.from_numpy(np.empty((n_frames, *self.shapes[key]), self.dtypes[key]))
+        return empty if self.device.type == "cpu" else th.empty_like(empty, device=self.device)
 
     def _map(self, key: str, shape: tuple[int, ...]) -> th.Tensor:
         """The key's file at its new size, mapped. It has no name, so the system removes it with the process."""
@@ -151,6 +151,10 @@ class FramePool:
         if hasattr(os, "posix_fallocate"):
             os.posix_fallocate(file.fileno(), 0, n_bytes)  # a full disk is an error now and not a crash later
         return th.from_numpy(np.memmap(file, self.dtypes[key], "r+", shape=shape))
+
+    def __del__(self) -> None:
+        for file in self.__dict__.get("_files", {}).values():
+            file.close()
 
     def __getstate__(self) -> dict[str, Any]:
         state = self.__dict__.copy()
