@@ -181,7 +181,10 @@ def main() -> None:
             rows.append(compare(kind, seed, args.steps, vehicles_count=args.vehicles))
             print(" ".join(f"{key}={value}" for key, value in rows[-1].items()), flush=True)
     total = {key: sum(row[key] for row in rows) for key in ("steps", "recycled", "lane_changes", "crashed", "values")}
-    print(f"no difference: {total}; median speed ratio {np.median([row['ratio'] for row in rows]):.2f}")
+    print(f"no difference: {total}")
+    for kind in KINDS:
+        ratio = np.median([row["ratio"] for row in rows if row["traffic"] == kind])
+        print(f"{kind}: {ratio:.2f} times as fast as highway-env (median of {args.seeds} seeds)")
     args.out.parent.mkdir(parents=True, exist_ok=True)
     with args.out.open("w", newline="") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
