@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -62,18 +61,6 @@ def interleave(
 def synchronize() -> None:
     if th.cuda.is_available():
         th.cuda.synchronize()
-
-
-def retain_memory() -> None:
-    """
-    Lets malloc keep what is freed, instead of handing it back to the system, which clears the pages anew every step.
-
-    :raises OSError: where the C library is not glibc
-    """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-    m_trim_threshold, m_mmap_max = -1, -4  # malloc.h; no trimming, and no block apart from the heap
-    if mallopt is None or not (mallopt(m_trim_threshold, -1) and mallopt(m_mmap_max, 0)):
-        raise OSError("malloc cannot be told to keep memory: this needs glibc.")
 
 
 def quartiles(times: Floats, prefix: str = "", digits: int = 3) -> Row:

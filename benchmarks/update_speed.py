@@ -14,7 +14,9 @@ actor, temperature and target are updated. Rows, printed and written to benchmar
 - ``encoders``: HAVESAC's encoders alone, forward and backward on observations and forward on next_observations, all
   decoded beforehand: the floor of a step in that precision;
 - ``sampling`` and ``decoding`` (bytes to floats): the other parts of the step that feed the encoders;
-- ``rest``: the step without these three: heads, losses, optimizers, target updates.
+- ``rest``: the step without these three: heads, losses, optimizers, target updates;
+- ``heads``: the same on its own, a step of HAVESAC on vectors in the features' place. What ``rest`` has more is the
+  encoders' part of optimizer and target update, and memory that the images have driven out of the caches.
 
 Columns: median and quartiles of the wall-clock time; ``cpu_ms``, median processor time; ``vs_sb3`` and
 ``vs_sb3_shared``, how many times faster than SB3; ``vs_floor``, time over that of the encoders; ``share`` of HAVESAC's
@@ -32,14 +34,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import cv2
+import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 from torch import nn
 
 from benchmarks.measure import (
@@ -50,13 +54,13 @@ from benchmarks.measure import (
     machine,
     median_ratio,
     quartiles,
-    retain_memory,
     save,
     show,
 )
 from benchmarks.random_sensors import CHANNELS, make_env, transitions
 from sb3_have import HAVESAC
 from sb3_have.common.encoders import MultiModalEncoder, default_layers
+from sb3_have.common.memory import keep_freed_memory
 
 FEATURES_DIM = 50
 NET_ARCH = [256, 256]
@@ -113,8 +117,13 @@ def sb3_sac(env: VecEnv, share_features_extractor: bool, device: str) -> SAC:
     return SAC("MultiInputPolicy", env, buffer_size=BUFFER_SIZE, policy_kwargs=policy_kwargs, seed=0, device=device)
 
 
-def have_sac(env: VecEnv, precision: str, device: str, **kwargs: Any) -> HAVESAC:
-    policy_kwargs = {"net_arch": NET_ARCH, "features_dim": FEATURES_DIM, "precision": precision}
+def have_sac(env: VecEnv, precision: str, device: str, encoder_classes: Any = None, **kwargs: Any) -> HAVESAC:
+    policy_kwargs = {
+        "net_arch": NET_ARCH,
+        "features_dim": FEATURES_DIM,
+        "precision": precision,
+        "encoder_classes": encoder_classes,
+    }
     return HAVESAC(
         "MultiInputPolicy", env, buffer_size=BUFFER_SIZE, policy_kwargs=policy_kwargs, seed=0, device=device, **kwargs
     )
@@ -129,6 +138,37 @@ def ready(models: Sequence[SAC], env: VecEnv) -> None:
     for model in models:
         model.replay_buffer = buffer
         model.set_logger(configure(None, []))
+
+
+class NormOnly(nn.LayerNorm):
+    """Stands for an encoder where only what comes after it is timed."""
+
+    def __init__(self, observation_space: spaces.Box, features_dim: int):
+        super().__init__(features_dim)
+
+
+class Features(gym.Env[Any, Any]):
+    """Only the spaces of an environment whose observations are features already."""
+
+    def __init__(self, modalities: int):
+        box = spaces.Box(-np.inf, np.inf, (FEATURES_DIM,), np.float32)
+        self.observation_space = spaces.Dict({f"z_{i}": box for i in range(modalities)})
+        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+
+def heads_alone(modalities: int, batch_size: int, device: str, compile: bool = False) -> Step:
+    """A step of HAVESAC on features: heads, losses, and their part of optimizer and target update."""
+    env = DummyVecEnv([lambda: Features(modalities)])
+    keys = [f"z_{i}" for i in range(modalities)]
+    model = have_sac(env, "float32", device, encoder_classes=dict.fromkeys(keys, NormOnly), compile=compile)
+    buffer = model.replay_buffer
+    assert isinstance(buffer, DictReplayBuffer)
+    rng = np.random.default_rng(0)
+    for _ in range(BUFFER_SIZE):
+        observations, following = ({key: rng.normal(size=(1, FEATURES_DIM)) for key in keys} for _ in range(2))
+        buffer.add(observations, following, rng.uniform(-1, 1, (1, 2)), rng.normal(size=1), np.zeros(1), [{}])
+    model.set_logger(configure(None, []))
+    return lambda: model.train(gradient_steps=1, batch_size=batch_size)
 
 
 class NoEncoder(nn.Module):
@@ -267,6 +307,8 @@ def measure(
     for precision in precisions:
         for part, step in parts(have["HAVESAC", precision], shape.batch_size).items():
             steps[part, precision] = step
+    heads = heads_alone(modalities, shape.batch_size, device, kwargs.get("compile", False))
+    steps.update({("heads", precision): heads for precision in precisions})  # float32 in any case
 
     rounds = rounds or shape.rounds
     repeats = 1 if device == "cpu" else 10
@@ -336,7 +378,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         kwargs["replay_buffer_kwargs"] = {"storage": args.storage}
         options += f" storage={args.storage}"
     if args.retain_memory:
-        retain_memory()
+        if not keep_freed_memory():
+            parser.error("--retain-memory: the C library has no mallopt")
         options += " retain-memory"
     about = machine(args.device)
     print(*about.values(), f"{args.threads} thread(s), options: {options}", sep="\n")

@@ -328,6 +328,37 @@ def test_samples_are_copies() -> None:
 
 
 @pytest.mark.parametrize(
+    "dtype", [np.uint8, np.int8, np.uint16, np.int32, np.int64, np.float16, np.float32, np.float64]
+)
+def test_types_of_arrays(dtype: Any) -> None:
+    """Any number that SB3's buffer takes, from arrays of any layout: views, mirrored, transposed, of another type."""
+    shape, n_stack = (6, 16, 16), 2
+    space = spaces.Dict({"image": spaces.Box(0, 100, shape, dtype), "vector": spaces.Box(0, 100, (3,), dtype)})
+    arguments: list[Any] = [10, space, spaces.Box(-1.0, 1.0, (2,), np.float32), "cpu", 2]
+    theirs = DictReplayBuffer(*arguments)
+    ours: ModalityReplayBuffer = partial(ModalityReplayBuffer, n_stack=n_stack)(*arguments)
+    rng = np.random.default_rng(0)
+
+    def observation(step: int) -> dict[str, np.ndarray]:
+        image, vector = rng.integers(0, 100, (2, 16, 16, 6)), rng.integers(0, 100, (2, 3)).astype(np.float64)
+        layouts = [
+            image.transpose(0, 3, 1, 2),
+            image.transpose(0, 3, 2, 1).astype(dtype),
+            image.reshape(2, *shape)[:, ::-1],
+        ]
+        mirrored = layouts[step % 3][..., ::-1]
+        return {"vector": vector[:, ::-1], "image": mirrored, "not in the space": vector}
+
+    obs = observation(0)
+    for step in range(1, 12):
+        next_obs = observation(step)
+        for buffer in (theirs, ours):
+            buffer.add(obs, next_obs, np.zeros((2, 2)), np.zeros(2), np.zeros(2), [{}, {}])
+        obs = next_obs
+        assert_same_samples(held(theirs), held(ours))
+
+
+@pytest.mark.parametrize(
     "shape,n_stack",
     [((20, 6, 6), 4), ((20, 6, 7), 4), ((6, 6, 20), 2), ((9, 4, 16), 3), ((2, 3, 4, 5), 2), ((3, 3), 3), ((3,), 3)],
 )
@@ -471,6 +502,16 @@ def test_overwriting_frees_frames() -> None:
         assert bytes_held(buffer) == held_once
 
 
+def test_many_wraps_leave_no_frame_behind() -> None:
+    """After anything, 50 transitions of a long episode use as many frames as in a new buffer."""
+    new, used = image_buffer(50), image_buffer(50)
+    for seed in range(3):
+        play(used, [1, 2, 1, 1, 30, 1, 1, 5] * 3, "arbitrary", seed)
+    play(new, [75])
+    play(used, [75])
+    assert used.pool.n_used == new.pool.n_used == 54  # the oldest stack's 3, the next one of each, the one of zeros
+
+
 @pytest.mark.parametrize("padding,frames", [("zeros", 2), ("repeat", 2), ("arbitrary", 4)])
 def test_episodes_of_one_step(padding: str, frames: int) -> None:
     """All transitions are held; each costs its own frames, those before the end and the one after."""
@@ -490,6 +531,12 @@ def test_values_cost_one_copy_a_step() -> None:
         buffer.add(obs, next_obs, np.zeros((1, 2)), np.zeros(1), np.zeros(1), [{}])
         obs = next_obs
     assert buffer.nbytes < 1.1 * 200 * 2048 * 4
+
+
+def test_pickle_holds_no_more_than_there_is() -> None:
+    buffer = image_buffer(400)
+    play(buffer, [20])
+    assert len(pickle.dumps(buffer)) < 30 * FRAME_BYTES + 400 * 256
 
 
 # -- Arguments

@@ -282,7 +282,7 @@ class ModalityReplayBuffer(ReplayBuffer):
 
     @property
     def nbytes(self) -> int:
-        """Bytes held: the frames in use and the tables."""
+        """Bytes that are really taken: of as many frames as were ever in use at once, and of the tables."""
         tables = (self.slots, self.continues, self.actions, self.rewards, self.dones, self.timeouts)
         return self.pool.nbytes + sum(table.nbytes for table in tables)
 

@@ -80,7 +80,7 @@ class FramePool:
     def write(self, slot: int, frames: Mapping[str, np.ndarray]) -> None:
         """Stores a frame of some keys."""
         for key, frame in frames.items():
-            self.frames[key][slot] = th.tensor(np.asarray(frame, self.dtypes[key]))
+            self.frames[key][slot] = th.from_numpy(np.array(frame, self.dtypes[key], order="C"))  # of any layout
 
     def gather(self, key: str, slots: np.ndarray, pin_memory: bool = False) -> th.Tensor:
         """Copies of the frames of ``key`` in these slots, (n,) to (n, *shape); in pinned memory where asked for."""
@@ -103,7 +103,7 @@ class FramePool:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the slots that have ever been used: what the frames really take."""
+        """Bytes of as many frames as were ever in use at once: what the pool really takes."""
         return sum(frames[: self._n_touched].nbytes for frames in self.frames.values())
 
     def _check_memory(self, capacity: int) -> None:
