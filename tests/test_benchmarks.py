@@ -36,7 +36,8 @@ def test_update_speed_has_a_row_for_every_contender_and_part() -> None:
     rows = update_speed.measure(SHAPE, modalities=2, precisions=["float32"])
     table = pd.DataFrame(rows).set_index("contender")
     assert set(table.index) == {
-        "SB3 SAC", "SB3 SAC shared", "HAVESAC", "HAVESAC no auxiliary", "encoders", "decoding", "sampling", "heads", "rest"
+        "SB3 SAC", "SB3 SAC shared", "HAVESAC", "HAVESAC no auxiliary", "encoders", "decoding", "sampling", "heads",
+        "rest",
     }  # fmt: skip
     assert (table["rounds"] == 2).all() and (table["modalities"] == 2).all()
     assert table.loc[["HAVESAC", "HAVESAC no auxiliary"], ["vs_sb3", "vs_sb3_shared", "vs_floor"]].gt(0).all(axis=None)
