@@ -1,10 +1,14 @@
 """How well HAVESAC learned to drive: evaluates the runs of ``sb3_have.train`` and draws their training.
 
-    python -m sb3_have.train --config havesac --seed 0 --steps 16000 --out runs/have-0   # and so on for each seed
-    python -m benchmarks.learning runs/have-0 runs/have-1 runs/have-2
+    for seed in 0 1 2; do for precision in float32 bfloat16; do
+        OMP_NUM_THREADS=1 python -m sb3_have.train --config havesac --seed $seed --steps 10000 \\
+            --hyperparams "policy_kwargs:{precision: $precision}" --out runs/$precision-$seed
+    done; done
+    python -m benchmarks.learning runs/float32-* runs/bfloat16-*
 
-Copies each run's training episodes to ``benchmarks/results/learning/monitor-<seed>.csv``, evaluates its model in the
-eight weathers (``evaluation.csv`` beside it) and draws ``docs/learning.png``. Without runs, it only draws.
+Copies each run's training episodes to ``benchmarks/results/learning/monitor-<run>.csv``, evaluates its model in the
+eight weathers (``evaluation.csv`` beside it) and draws ``docs/learning.png``, one colour for the seeds of a kind (the
+name of a run without its number). Without runs, it only draws.
 """
 
 import argparse
@@ -39,13 +43,13 @@ def evaluate_runs(runs: list[Path], episodes: int) -> None:
     for run in runs:
         model = HAVESAC.load(run / "model.zip")
         frame = evaluate(model, ENV_ID, WEATHERS, episodes, env_kwargs=env_kwargs, progress_bar=True)
-        frame.insert(0, "seed", model.seed)
+        frame.insert(0, "run", run.name)
         frame.insert(1, "step", model.num_timesteps)
         frames.append(frame)
-        (LEARNING / f"monitor-{model.seed}.csv").write_text((run / "monitor.csv").read_text())
+        (LEARNING / f"monitor-{run.name}.csv").write_text((run / "monitor.csv").read_text())
         pd.concat(frames).round(3).to_csv(LEARNING / "evaluation.csv", index=False)
         print(
-            f"seed {model.seed}, {model.num_timesteps} steps: distance {frame['distance_mean'].mean():.0f} m, "
+            f"{run.name}, {model.num_timesteps} steps: distance {frame['distance_mean'].mean():.0f} m, "
             f"return {frame['return_mean'].mean():.1f}, crashes {frame['crash_share'].mean():.0%}, "
             f"off the road {frame['offroad_share'].mean():.0%}, {episodes * len(WEATHERS)} episodes",
             flush=True,
@@ -57,10 +61,14 @@ def draw(out: Path, window: int = 20) -> None:
     figure = Figure(figsize=(8, 4), layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
+    colours: dict[str, str] = {}
     for file in sorted(LEARNING.glob("monitor-*.csv")):
+        kind = file.stem.removeprefix("monitor-").rpartition("-")[0]
+        label = None if kind in colours else f"HAVESAC {kind}"
+        colour = colours.setdefault(kind, f"C{len(colours)}")
         episodes = pd.read_csv(file, skiprows=1)
         steps, distance = episodes["l"].cumsum(), episodes["distance"].rolling(window, min_periods=1).mean()
-        axes.plot(steps, distance, label=f"HAVESAC, seed {file.stem.removeprefix('monitor-')}")
+        axes.plot(steps, distance, colour, label=label)
     table = pd.read_csv(RESULTS / "state_learnability.csv").drop_duplicates("setting", keep="last")
     levels = dict(zip(table["setting"], table["distance_mean"].astype(float), strict=True))
     for (name, setting), style in zip(DRIVERS.items(), (":", "--", "-.", "-"), strict=True):

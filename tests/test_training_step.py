@@ -10,6 +10,7 @@ import pytest
 import torch as th
 from envs import RandomSensors, changed, clone_parameters, fill_buffer, image, sensors_space, tiny_model, vectors_space
 from gymnasium import spaces
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_have import HAVESAC, ModalityReplayBuffer
@@ -196,6 +197,14 @@ def test_n_steps_and_gamma_reach_the_replay_buffer() -> None:
     assert (model.replay_buffer.n_steps, model.replay_buffer.gamma) == (3, 0.7)
     own = tiny_model(sensors_space(), replay_buffer_class=ModalityReplayBuffer, replay_buffer_kwargs={"n_steps": 2})
     assert isinstance(own.replay_buffer, ModalityReplayBuffer) and own.replay_buffer.n_steps == 2
+
+
+def test_model_loaded_without_environment_knows_the_stack(tmp_path: Any) -> None:
+    """Its replay buffer, made for an environment that may come later, would take three times the memory."""
+    model = tiny_model(sensors_space(), env=VecFrameStack(DummyVecEnv([lambda: RandomSensors(sensors_space())]), 3))
+    model.save(tmp_path / "model")
+    loaded = HAVESAC.load(tmp_path / "model")
+    assert isinstance(loaded.replay_buffer, ModalityReplayBuffer) and loaded.replay_buffer.n_stack == 3
 
 
 # -- For programs that train

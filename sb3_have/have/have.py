@@ -163,6 +163,7 @@ class HAVESAC(SAC):
         self.modality_dropout = modality_dropout
         self.auxiliary_coefs = {term: 1.0 for loss in losses.values() for term in loss.terms}
         self.compile = compile
+        self.n_stack = 1
         self._last_losses: dict[str, th.Tensor] = {}
         if _init_setup_model:
             self._setup_model()
@@ -181,9 +182,10 @@ class HAVESAC(SAC):
         given = self.n_steps, self.replay_buffer_kwargs
         if self.replay_buffer_class is None and (self.n_steps > 1 or _has_images(self.observation_space)):
             self.replay_buffer_class = ModalityReplayBuffer
+        if self.env is not None:  # else the model is being loaded, and this with it
+            self.n_stack = stacked_frames(self.env)
         if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, ModalityReplayBuffer):
-            n_stack = 1 if self.env is None else stacked_frames(self.env)
-            buffer_kwargs = {"n_stack": n_stack, "n_steps": self.n_steps, "gamma": self.gamma}
+            buffer_kwargs = {"n_stack": self.n_stack, "n_steps": self.n_steps, "gamma": self.gamma}
             self.n_steps, self.replay_buffer_kwargs = (
                 1,
                 buffer_kwargs | self.replay_buffer_kwargs,
