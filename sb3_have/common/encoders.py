@@ -158,6 +158,7 @@ class MultiModalEncoder(nn.Module):
         self.signed_keys = frozenset(signed_keys)
         self.normalize_images = normalize_images
         self.precision = precision
+        self.native_bfloat16 = [device for device in ("cpu", "cuda") if has_native_bfloat16(device)]
         self.encoders = nn.ModuleList()
         for name, modality in self.modalities.items():
             default_class = ImageEncoder if modality.is_image else VectorEncoder
@@ -187,7 +188,7 @@ class MultiModalEncoder(nn.Module):
 
     def image_dtype(self, device: th.device) -> th.dtype:
         """The arithmetic of the image encoders on ``device``."""
-        bfloat16 = self.precision == "bfloat16" or (self.precision == "auto" and has_native_bfloat16(device.type))
+        bfloat16 = self.precision == "bfloat16" or (self.precision == "auto" and device.type in self.native_bfloat16)
         return th.bfloat16 if bfloat16 else th.float32
 
     def _decode(self, key: str, observation: th.Tensor, is_image: bool, dtype: th.dtype) -> th.Tensor:
@@ -195,7 +196,8 @@ class MultiModalEncoder(nn.Module):
             return observation.to(dtype).flatten(start_dim=1)
         signed = key in self.signed_keys
         if self.normalize_images and observation.dtype == th.uint8 and observation.device.type == "cpu":
-            return _look_up(observation, signed, dtype)
+            decoded: th.Tensor = _look_up(observation, signed, dtype)
+            return decoded
         observation = observation.contiguous(memory_format=th.channels_last)  # before it has more bytes
         return (decode_bytes(observation, signed) if self.normalize_images else observation).to(dtype)
 
@@ -207,6 +209,7 @@ def decode_bytes(values: th.Tensor, signed: bool) -> th.Tensor:
     return values.to(th.float32) / 255
 
 
+@th.compiler.disable  # type: ignore[untyped-decorator, unused-ignore]
 def _look_up(images: th.Tensor, signed: bool, dtype: th.dtype) -> th.Tensor:
     """
     :func:`decode_bytes` of uint8 images (B, C, H, W) in the CPU's memory, to channels last: by a table, image by image,
@@ -229,11 +232,10 @@ def _table(signed: bool, dtype: th.dtype) -> np.ndarray:
     return (table.view(th.int16) if dtype == th.bfloat16 else table).numpy()
 
 
-@cache
 def has_native_bfloat16(device_type: str) -> bool:
     """Whether the hardware multiplies bfloat16 matrices natively: a CPU with AMX, or CUDA from sm80 on."""
     if device_type == "cuda":
-        return th.cuda.get_device_capability() >= (8, 0)
+        return th.cuda.is_available() and th.cuda.get_device_capability() >= (8, 0)
     return device_type == "cpu" and th.cpu._is_amx_tile_supported()
 
 
