@@ -35,6 +35,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack
 
 import sb3_have
+from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
 from sb3_have.common.evaluation import evaluate, leave_interrupts_to_parent
 from sb3_have.common.memory import keep_freed_memory
 from sb3_have.envs.weather import WEATHERS
@@ -254,7 +255,11 @@ class Run:
     def _make_model(self, checkpoint: Path | None, env: VecEnv) -> OffPolicyAlgorithm:
         algorithm = algorithms()[self.algo]
         if checkpoint is None:
-            return algorithm(env=env, seed=self.seed, device=self.device, **model_kwargs(self.config))
+            kwargs = model_kwargs(self.config)
+            if self.algo == "sac":  # as HAVESAC has by default, in a sixth of the memory
+                kwargs.setdefault("replay_buffer_class", ModalityReplayBuffer)
+                kwargs.setdefault("replay_buffer_kwargs", {"n_stack": stacked_frames(env)})
+            return algorithm(env=env, seed=self.seed, device=self.device, **kwargs)
         model = algorithm.load(checkpoint / "model.zip", env=env, device=self.device)
         model.load_replay_buffer(checkpoint / "replay_buffer.pkl")
         # other episodes and noise than those at the start of the run
@@ -345,9 +350,14 @@ def hyperparameter(text: str) -> tuple[str, Any]:
     if not separator:
         raise argparse.ArgumentTypeError(f"expected NAME:VALUE, got {text!r}")
     try:
-        return name, float(value) if "e" in value.lower() else yaml.safe_load(value)
+        number = float(value)
+        return name, int(number) if number.is_integer() and "." not in value else number
     except ValueError:
+        pass
+    try:
         return name, yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not YAML behind the colon: {error}") from error
 
 
 def main(arguments: list[str] | None = None) -> None:

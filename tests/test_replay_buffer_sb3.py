@@ -401,3 +401,25 @@ def test_mmap_survives_its_model(tmp_path: Path) -> None:
     assert other.replay_buffer is not None
     assert_same_samples(expected, held(other.replay_buffer))
     other.learn(30)
+
+
+def test_model_is_loaded_where_its_mmap_directory_is_not(tmp_path: Path) -> None:
+    """To predict, no replay memory is needed."""
+    kwargs = {"storage": "mmap", "mmap_dir": str(tmp_path / "frames")}
+    model = tiny_model(sensors_space(), env=stack_then_transpose(), replay_buffer_kwargs=kwargs)
+    model.save(tmp_path / "model")
+    loaded = HAVESAC.load(tmp_path / "model")
+    loaded.predict(loaded.observation_space.sample())
+    with pytest.raises(ValueError, match="mmap_dir"):
+        HAVESAC.load(tmp_path / "model", env=stack_then_transpose()).learn(4)
+
+
+@pytest.mark.parametrize("given,n_steps", [({}, 1), ({"n_steps": 2}, 2)], ids=str)
+def test_loaded_buffer_has_the_models_n_steps(given: dict[str, Any], n_steps: int, tmp_path: Path) -> None:
+    model = tiny_model(sensors_space(), env=stack_then_transpose(), n_steps=3, gamma=0.9)
+    model.learn(20)
+    model.save_replay_buffer(tmp_path / "buffer")
+    other = tiny_model(sensors_space(), env=stack_then_transpose(), gamma=0.5, replay_buffer_kwargs=given)
+    other.load_replay_buffer(tmp_path / "buffer")
+    assert isinstance(other.replay_buffer, ModalityReplayBuffer)
+    assert (other.replay_buffer.n_steps, other.replay_buffer.gamma) == (n_steps, 0.5)

@@ -76,6 +76,17 @@ def test_what_bytes_stand_for() -> None:
     np.testing.assert_allclose(decode_bytes(values, signed=False), values.numpy() / 255, rtol=1e-6)
 
 
+def test_encoder_can_be_exported() -> None:
+    """The table is not part of the graph, and the numbers are the same."""
+    space = spaces.Dict({key: spaces.Box(0, 255, (3, 36, 36), np.uint8) for key in ("rgb", "event")})
+    encoder = MultiModalEncoder(space, features_dim=4, precision="float32")
+    generator = th.Generator().manual_seed(0)
+    observations = {key: th.randint(256, (2, 3, 36, 36), dtype=th.uint8, generator=generator) for key in space.spaces}
+    exported = th.export.export(encoder, (observations,)).module()
+    with th.no_grad():
+        th.testing.assert_close(exported(observations), encoder(observations))
+
+
 def test_arithmetic_is_announced_once(capsys: pytest.CaptureFixture[str]) -> None:
     model = tiny_model(sensors_space(), {"precision": "bfloat16"}, verbose=1)
     fill_buffer(model, 20)
@@ -235,8 +246,10 @@ print(faults[-1] - faults[0])
 
 def test_hyperparameters_of_the_command_line() -> None:
     assert hyperparameter("learning_rate:3e-4") == ("learning_rate", 3e-4)
-    assert hyperparameter("batch_size:32") == ("batch_size", 32)
+    for text, value in (("32", 32), ("1e5", 100_000), ("1.0", 1.0), ("0.5", 0.5)):
+        assert hyperparameter(f"x:{text}") == ("x", value) and type(hyperparameter(f"x:{text}")[1]) is type(value)
     assert hyperparameter("ent_coef:auto_0.1") == ("ent_coef", "auto_0.1")
     assert hyperparameter("policy_kwargs:{precision: float32}") == ("policy_kwargs", {"precision": "float32"})
-    with pytest.raises(argparse.ArgumentTypeError, match="NAME:VALUE"):
-        hyperparameter("gamma")
+    for text, message in (("gamma", "NAME:VALUE"), ("net_arch:[64", "not YAML")):
+        with pytest.raises(argparse.ArgumentTypeError, match=message):
+            hyperparameter(text)

@@ -29,11 +29,11 @@ class ModalityReplayBuffer(ReplayBuffer):
     SB3 takes it too: ``SAC("MultiInputPolicy", env, replay_buffer_class=ModalityReplayBuffer,
     replay_buffer_kwargs=dict(n_stack=stacked_frames(env)))``.
 
-    Asked for in SB3 issues #37 and #1936 and PR #243 (n-step and memory for Dict observations).
+    SB3's users have asked for both, for Dict observations, in its issues #37 and #1936 and its pull request #243.
 
     :param buffer_size: transitions, over all environments
-    :param observation_space: Dict of Boxes or other array-valued spaces, or a Box; images (kC, H, W) are split into k
-        frames, every other key is stored whole, once a step
+    :param observation_space: Dict of Boxes or other array-valued spaces, or a Box; uint8 images (kC, H, W) are split
+        into k frames, every other key is stored whole, once a step
     :param action_space: as in SB3
     :param device: where samples go
     :param n_envs: number of parallel environments
@@ -46,7 +46,8 @@ class ModalityReplayBuffer(ReplayBuffer):
     :param storage: "memory", "mmap" (temporary files, for more than fits into memory) or "device" (frames on the
         device, where CUDA gathers them without the host)
     :param mmap_dir: directory for the files of "mmap"; by default the system's for temporary files
-    :raises ValueError: for bad arguments; the message names them
+    :raises ValueError: for bad arguments; the message names them and the remedy. Memory is reserved when the first
+        transition comes: then a lack of it raises MemoryError, a full disk OSError
     """
 
     def __init__(
@@ -83,12 +84,7 @@ class ModalityReplayBuffer(ReplayBuffer):
             space = observation_space if subspaces is None else subspaces[key]
             dtypes[key] = np.dtype(space.dtype)
             frame_shapes[key] = shape
-            if n_stack > 1 and is_image_space(space) and np.argmin(shape) == 0:  # channels first
-                if shape[0] % n_stack:
-                    raise ValueError(
-                        f"n_stack={n_stack}: observation key {key!r} has {shape[0]} channels, which are not {n_stack} "
-                        "frames; give the number of frames that VecFrameStack stacks."
-                    )
+            if is_image_space(space) and np.argmin(shape) == 0 and shape[0] % n_stack == 0:  # channels first
                 frame_shapes[key] = (shape[0] // n_stack, *shape[1:])
                 self.stacked_keys.append(key)
 

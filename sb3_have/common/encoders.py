@@ -47,12 +47,12 @@ class ImageEncoder(nn.Module):
         self.convolutions = nn.Sequential(*modules)
         with th.no_grad():
             n_flatten = self.convolutions(th.zeros(1, *observation_space.shape)).numel()
-        self.projection = nn.Sequential(nn.Linear(n_flatten, features_dim), nn.LayerNorm(features_dim))
+        self.output = nn.Sequential(nn.Linear(n_flatten, features_dim), nn.LayerNorm(features_dim))
         self.to(memory_format=th.channels_last)  # type: ignore[call-overload]
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
         maps = self.convolutions(observations.contiguous(memory_format=th.channels_last))
-        features: th.Tensor = self.projection(maps.permute(0, 2, 3, 1).flatten(start_dim=1))  # a view, not a copy
+        features: th.Tensor = self.output(maps.permute(0, 2, 3, 1).flatten(start_dim=1))  # a view, not a copy
         return features
 
 
@@ -158,7 +158,6 @@ class MultiModalEncoder(nn.Module):
         self.signed_keys = frozenset(signed_keys)
         self.normalize_images = normalize_images
         self.precision = precision
-        self.native_bfloat16 = [device for device in ("cpu", "cuda") if has_native_bfloat16(device)]
         self.encoders = nn.ModuleList()
         for name, modality in self.modalities.items():
             default_class = ImageEncoder if modality.is_image else VectorEncoder
@@ -188,16 +187,16 @@ class MultiModalEncoder(nn.Module):
 
     def image_dtype(self, device: th.device) -> th.dtype:
         """The arithmetic of the image encoders on ``device``."""
-        bfloat16 = self.precision == "bfloat16" or (self.precision == "auto" and device.type in self.native_bfloat16)
+        bfloat16 = self.precision == "bfloat16" or (self.precision == "auto" and has_native_bfloat16(device.type))
         return th.bfloat16 if bfloat16 else th.float32
 
     def _decode(self, key: str, observation: th.Tensor, is_image: bool, dtype: th.dtype) -> th.Tensor:
         if not is_image:
             return observation.to(dtype).flatten(start_dim=1)
         signed = key in self.signed_keys
-        if self.normalize_images and observation.dtype == th.uint8 and observation.device.type == "cpu":
-            decoded: th.Tensor = _look_up(observation, signed, dtype)
-            return decoded
+        traced = th.compiler.is_compiling() or th.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
+        if self.normalize_images and observation.dtype == th.uint8 and observation.device.type == "cpu" and not traced:
+            return _look_up(observation, signed, dtype)
         observation = observation.contiguous(memory_format=th.channels_last)  # before it has more bytes
         return (decode_bytes(observation, signed) if self.normalize_images else observation).to(dtype)
 
@@ -209,7 +208,6 @@ def decode_bytes(values: th.Tensor, signed: bool) -> th.Tensor:
     return values.to(th.float32) / 255
 
 
-@th.compiler.disable  # type: ignore[untyped-decorator, unused-ignore]
 def _look_up(images: th.Tensor, signed: bool, dtype: th.dtype) -> th.Tensor:
     """
     :func:`decode_bytes` of uint8 images (B, C, H, W) in the CPU's memory, to channels last: by a table, image by image,
@@ -228,14 +226,15 @@ def _look_up(images: th.Tensor, signed: bool, dtype: th.dtype) -> th.Tensor:
 @cache
 def _table(signed: bool, dtype: th.dtype) -> np.ndarray:
     """The 256 values of :func:`decode_bytes`; OpenCV knows no bfloat16, so that one is given as its bits."""
-    table = decode_bytes(th.arange(256), signed).to(dtype)
+    table = decode_bytes(th.arange(256, device="cpu"), signed).to(dtype)
     return (table.view(th.int16) if dtype == th.bfloat16 else table).numpy()
 
 
+@th.compiler.assume_constant_result  # type: ignore[untyped-decorator]
 def has_native_bfloat16(device_type: str) -> bool:
     """Whether the hardware multiplies bfloat16 matrices natively: a CPU with AMX, or CUDA from sm80 on."""
     if device_type == "cuda":
-        return th.cuda.is_available() and th.cuda.get_device_capability() >= (8, 0)
+        return th.cuda.get_device_capability() >= (8, 0)
     return device_type == "cpu" and th.cpu._is_amx_tile_supported()
 
 

@@ -3,6 +3,7 @@
 import os
 import tempfile
 import warnings
+from bisect import bisect_right
 from collections.abc import Iterable, Mapping
 from typing import Any
 
@@ -23,18 +24,17 @@ class FramePool:
     """
     Slots that each hold one frame of every observation key, handed out and taken back one by one.
 
-    A freed slot is the first to be used again, so the memory touched is what was in use at once, whatever the
-    capacity. The pool grows by a quarter when it is exhausted.
+    A freed slot is the first to be used again, so what is written is what was in use at once, whatever the capacity.
+    The first slot taken reserves a block for all of the ``capacity``; a pool that needs more gets further blocks, so
+    that nothing is ever moved.
 
-    :param capacity: number of slots to begin with
+    :param capacity: slots of the first block
     :param shapes: shape of a frame, for each key
     :param dtypes: NumPy dtype of each key
     :param storage: "memory", "mmap" (unnamed temporary files, for more frames than fit into memory) or "device"
     :param device: where "device" keeps its frames
     :param mmap_dir: directory for the files of "mmap"; by default the system's, which may itself be in memory
-    :raises ValueError: for an unknown storage, or a directory that does not exist
-    :raises MemoryError: if the device has no room for the frames
-    :raises OSError: if the disk has no room for the files
+    :raises ValueError: for an unknown storage, or a directory without "mmap"
     """
 
     def __init__(
@@ -48,30 +48,34 @@ class FramePool:
     ):
         if storage not in STORAGES:
             raise ValueError(f"storage={storage!r}: expected one of {STORAGES}.")
-        if mmap_dir is not None and not (storage == "mmap" and os.path.isdir(mmap_dir)):
-            raise ValueError(
-                f"mmap_dir={os.fspath(mmap_dir)!r}: expected an existing directory, together with storage='mmap'."
-            )
-        self.shapes, self.dtypes = dict(shapes), dict(dtypes)
+        if mmap_dir is not None and storage != "mmap":
+            raise ValueError(f"mmap_dir={os.fspath(mmap_dir)!r} with storage={storage!r}: give it with 'mmap' only.")
+        self.capacity, self.shapes, self.dtypes = capacity, dict(shapes), dict(dtypes)
         self.storage, self.mmap_dir = storage, mmap_dir
         self.device = get_device(device) if storage == "device" else th.device("cpu")
-        self.frames: dict[str, th.Tensor] = {}
-        self._files: dict[str, Any] = {}
-        self._capacity = 0
-        self._n_touched = 0  # slots below have been written
+        self._blocks: list[dict[str, th.Tensor]] = []
+        self._starts: list[int] = []  # first slot of each block
+        self._n_reserved = 0
+        self._n_written = 0  # slots below have been in use at some time
         self._free: list[int] = []
-        self._check_memory(capacity)
-        self._reserve(max(capacity, 2))
-        self.write(self.take(), {key: np.zeros(shape) for key, shape in self.shapes.items()})  # EMPTY
 
     def take(self) -> int:
-        """A free slot, which is the caller's until it is given back."""
+        """
+        A free slot, which is the caller's until it is given back.
+
+        :raises ValueError: if ``mmap_dir`` does not exist
+        :raises MemoryError: if there is no room for another block
+        :raises OSError: if the disk has none
+        """
         if self._free:
             return self._free.pop()
-        if self._n_touched == self._capacity:
-            self._reserve(self._capacity + max(self._capacity // 4, 16))
-        self._n_touched += 1
-        return self._n_touched - 1
+        if self._n_written == self._n_reserved:
+            self._reserve(max(self.capacity - self._n_reserved, self._n_reserved // 4, 16))
+        if self._n_written == EMPTY:
+            self._n_written += 1
+            self.write(EMPTY, {key: np.zeros(shape) for key, shape in self.shapes.items()})
+        self._n_written += 1
+        return self._n_written - 1
 
     def give_back(self, slots: Iterable[int]) -> None:
         """Frees these slots."""
@@ -79,99 +83,121 @@ class FramePool:
 
     def write(self, slot: int, frames: Mapping[str, np.ndarray]) -> None:
         """Stores a frame of some keys."""
+        number = bisect_right(self._starts, slot) - 1
         for key, frame in frames.items():
-            self.frames[key][slot] = th.from_numpy(np.array(frame, self.dtypes[key], order="C"))  # of any layout
+            array = np.array(frame, self.dtypes[key], order="C")  # of any layout
+            self._blocks[number][key][slot - self._starts[number]] = th.from_numpy(array)
 
     def gather(self, key: str, slots: np.ndarray, pin_memory: bool = False) -> th.Tensor:
         """Copies of the frames of ``key`` in these slots, (n,) to (n, *shape); in pinned memory where asked for."""
-        frames = self.frames[key]
-        out = self._empty(key, len(slots))
-        if pin_memory and out.device.type == "cpu":
-            out = th.empty(out.shape, dtype=out.dtype, pin_memory=True)
-        return th.index_select(frames, 0, th.from_numpy(slots).to(frames.device), out=out)
+        out = self._empty(key, len(slots), pin_memory)
+        if len(self._blocks) == 1:
+            return th.index_select(self._blocks[0][key], 0, self._index(slots), out=out)
+        numbers = np.searchsorted(self._starts, slots, side="right") - 1
+        for number, (start, block) in enumerate(zip(self._starts, self._blocks, strict=True)):
+            rows = np.flatnonzero(numbers == number)
+            out[self._index(rows)] = block[key].index_select(0, self._index(slots[rows] - start))
+        return out
+
+    def _index(self, slots: np.ndarray) -> th.Tensor:
+        index = th.from_numpy(slots)
+        # pinned, a GPU's copy does not make the host wait
+        return index if self.device.type == "cpu" else index.pin_memory().to(self.device, non_blocking=True)
 
     def to(self, device: th.device) -> None:
         """Moves the frames of "device" storage; the others stay where they are."""
         if self.storage == "device" and device != self.device:
             self.device = device
-            self.frames = {key: frames.to(device) for key, frames in self.frames.items()}
+            self._blocks = [{key: frames.to(device) for key, frames in block.items()} for block in self._blocks]
 
     @property
     def n_used(self) -> int:
         """Slots in use, :data:`EMPTY` among them."""
-        return self._n_touched - len(self._free)
+        return self._n_written - len(self._free)
 
     @property
     def nbytes(self) -> int:
         """Bytes of as many frames as were ever in use at once: what the pool really takes."""
-        return sum(frames[: self._n_touched].nbytes for frames in self.frames.values())
+        return self._n_written * self._frame_bytes
 
-    def _check_memory(self, capacity: int) -> None:
-        """Warns like SB3's buffers: memory is only taken when frames come in, so it would run out in mid-training."""
-        if self.storage != "memory" or psutil is None:
-            return
-        needed = capacity * sum(int(np.prod(shape)) * self.dtypes[key].itemsize for key, shape in self.shapes.items())
-        available = psutil.virtual_memory().available
-        if needed > available:
-            warnings.warn(
-                f"The replay buffer's frames will take {needed / 1e9:.1f} GB, but only {available / 1e9:.1f} GB of "
-                'memory are available: lower `buffer_size`, or use `replay_buffer_kwargs=dict(storage="mmap")`.',
-                stacklevel=4,
-            )
+    @property
+    def _frame_bytes(self) -> int:
+        return sum(int(np.prod(shape)) * self.dtypes[key].itemsize for key, shape in self.shapes.items())
 
-    def _reserve(self, capacity: int) -> None:
-        for key, shape in self.shapes.items():
-            if self.storage == "mmap":
-                self.frames[key] = self._map(key, (capacity, *shape))
-                continue
-            try:
-                larger = self._empty(key, capacity)
-            except (MemoryError, RuntimeError) as error:
-                raise MemoryError(
-                    f"No memory on {self.device} for {capacity} frames {shape} of {key!r}: lower `buffer_size`, or "
-                    'use `replay_buffer_kwargs=dict(storage="mmap")`.'
-                ) from error
-            if self._n_touched:
-                larger[: self._n_touched] = self.frames[key][: self._n_touched]
-            self.frames[key] = larger
-        self._capacity = capacity
+    def _reserve(self, n_frames: int) -> None:
+        if self.storage == "memory" and psutil is not None:
+            needed, available = n_frames * self._frame_bytes, psutil.virtual_memory().available
+            if needed > available:  # memory is taken as frames come in, so it would run out in mid-training
+                warnings.warn(
+                    f"The replay buffer's frames will take {needed / 1e9:.1f} GB, but only {available / 1e9:.1f} GB of "
+                    'memory are available: lower `buffer_size`, or use `replay_buffer_kwargs=dict(storage="mmap")`.',
+                    stacklevel=4,
+                )
+        make = self._map if self.storage == "mmap" else self._empty
+        self._blocks.append({key: make(key, n_frames) for key in self.shapes})
+        self._starts.append(self._n_reserved)
+        self._n_reserved += n_frames
 
-    def _empty(self, key: str, n_frames: int) -> th.Tensor:
-        """Room for frames, which takes no memory until they are written; NumPy's comes in huge pages, PyTorch's not."""
-        empty = th.from_numpy(np.empty((n_frames, *self.shapes[key]), self.dtypes[key]))
-        return empty if self.device.type == "cpu" else th.empty_like(empty, device=self.device)
+    def _empty(self, key: str, n_frames: int, pin_memory: bool = False) -> th.Tensor:
+        """Room for frames, which takes no memory of the host before they are written."""
+        shape = (n_frames, *self.shapes[key])
+        try:
+            if self.device.type == "cpu" and not pin_memory:
+                return th.from_numpy(np.empty(shape, self.dtypes[key]))  # in huge pages, which PyTorch's are not
+            dtype = th.from_numpy(np.empty(0, self.dtypes[key])).dtype
+            return th.empty(shape, dtype=dtype, device=self.device, pin_memory=pin_memory and self.device.type == "cpu")
+        except (MemoryError, RuntimeError) as error:
+            raise MemoryError(
+                f"No memory on {self.device} for {n_frames} frames {self.shapes[key]} of {key!r}: lower `buffer_size`, "
+                'or use `replay_buffer_kwargs=dict(storage="mmap")`.'
+            ) from error
 
-    def _map(self, key: str, shape: tuple[int, ...]) -> th.Tensor:
-        """The key's file at its new size, mapped. It has no name, so the system removes it with the process."""
-        if key not in self._files:
-            self._files[key] = tempfile.TemporaryFile(dir=self.mmap_dir)  # noqa: SIM115 open as long as it is mapped
-        file = self._files[key]
+    def _map(self, key: str, n_frames: int) -> th.Tensor:
+        """The same in a file without a name, which the system removes with the process."""
+        if self.mmap_dir is not None and not os.path.isdir(self.mmap_dir):
+            raise ValueError(f"mmap_dir={os.fspath(self.mmap_dir)!r}: no such directory; make it, or name another one.")
+        shape = (n_frames, *self.shapes[key])
         n_bytes = int(np.prod(shape)) * self.dtypes[key].itemsize
-        file.truncate(n_bytes)
-        if hasattr(os, "posix_fallocate"):
-            os.posix_fallocate(file.fileno(), 0, n_bytes)  # a full disk is an error now and not a crash later
-        return th.from_numpy(np.memmap(file, self.dtypes[key], "r+", shape=shape))
-
-    def __del__(self) -> None:
-        for file in self.__dict__.get("_files", {}).values():
-            file.close()
+        with tempfile.TemporaryFile(dir=self.mmap_dir) as file:
+            try:
+                if hasattr(os, "posix_fallocate"):
+                    os.posix_fallocate(file.fileno(), 0, n_bytes)  # a full disk is an error now and not a crash later
+                else:
+                    file.truncate(n_bytes)
+            except OSError as error:
+                raise OSError(
+                    error.errno,
+                    f"{error.strerror}: no room for {n_bytes / 1e9:.1f} GB of frames of {key!r} in "
+                    f"{os.fspath(self.mmap_dir or tempfile.gettempdir())!r}; lower `buffer_size`, or name another "
+                    "`mmap_dir`",
+                ) from error
+            return th.from_numpy(np.memmap(file, self.dtypes[key], "r+", shape=shape))
 
     def __getstate__(self) -> dict[str, Any]:
+        """What has been written, and no more."""
         state = self.__dict__.copy()
-        del state["_files"]
-        state["frames"] = {key: frames[: self._n_touched].cpu().numpy() for key, frames in self.frames.items()}
+        state["_blocks"] = [
+            {key: frames[: max(self._n_written - start, 0)].cpu().numpy() for key, frames in block.items()}
+            for start, block in zip(self._starts, self._blocks, strict=True)
+        ]
+        state["_n_reserved"] = self._n_written
         return state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        frames = state.pop("frames")
         self.__dict__.update(state)
         if self.device.type == "cuda" and not th.cuda.is_available():
             self.device = th.device("cpu")
         if self.mmap_dir is not None and not os.path.isdir(self.mmap_dir):
             self.mmap_dir = None  # another machine
-        self.frames, self._files = {}, {}
-        n_touched, self._n_touched = self._n_touched, 0
-        self._reserve(self._capacity)
-        self._n_touched = n_touched
-        for key, saved in frames.items():
-            self.frames[key][:n_touched] = th.from_numpy(saved)
+        self._blocks = [
+            {key: self._stored(key, np.require(frames, requirements="W")) for key, frames in block.items()}
+            for block in state["_blocks"]
+        ]
+
+    def _stored(self, key: str, frames: np.ndarray) -> th.Tensor:
+        """Loaded frames where they belong; those in memory stay where they were loaded, without a copy."""
+        if self.storage != "mmap":
+            return th.from_numpy(frames).to(self.device)
+        mapped = self._map(key, len(frames))
+        mapped[:] = th.from_numpy(frames)
+        return mapped

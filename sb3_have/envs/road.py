@@ -65,8 +65,10 @@ class HighwayRoad(Road):
         # Nobody moves while everybody decides: place each vehicle on each lane only once.
         self._placed = [(*v.position.tolist(), v) for v in self.vehicles]
         self._on_lane = {}
-        super().act()
-        self._placed = None
+        try:
+            super().act()
+        finally:
+            self._placed = None
 
     def neighbour_vehicles(
         self, vehicle: Vehicle, lane_index: LaneIndex | None = None

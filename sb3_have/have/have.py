@@ -38,7 +38,7 @@ class HAVESAC(SAC):
 
     :param policy: "MultiInputPolicy" or a subclass of :class:`MultiModalPolicy`
     :param env: environment with Box actions and Dict (or Box) observations
-    :param replay_buffer_class: by default :class:`~sb3_have.ModalityReplayBuffer` for images and for n-step returns,
+    :param replay_buffer_class: by default :class:`~sb3_have.ModalityReplayBuffer` for uint8 images and n-step returns,
         SB3's otherwise; it is told the number of frames that VecFrameStack stacks
     :param n_steps: length of n-step returns, for Dict observations too; DeepMDP then predicts n steps ahead from one
         action
@@ -179,17 +179,14 @@ class HAVESAC(SAC):
         for name in ("policy_delay", "target_update_interval"):
             if not (isinstance(interval := getattr(self, name), int) and interval >= 1):
                 raise ValueError(f"{name}={interval!r}: expected a whole number of updates, from 1 on.")
-        given = self.n_steps, self.replay_buffer_kwargs
-        if self.replay_buffer_class is None and (self.n_steps > 1 or _has_images(self.observation_space)):
-            self.replay_buffer_class = ModalityReplayBuffer
         if self.env is not None:  # else the model is being loaded, and this with it
             self.n_stack = stacked_frames(self.env)
+        if self.replay_buffer_class is None and (self.n_steps > 1 or _has_images(self.observation_space)):
+            self.replay_buffer_class = ModalityReplayBuffer
+        given = self.n_steps, self.replay_buffer_kwargs
         if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, ModalityReplayBuffer):
-            buffer_kwargs = {"n_stack": self.n_stack, "n_steps": self.n_steps, "gamma": self.gamma}
-            self.n_steps, self.replay_buffer_kwargs = (
-                1,
-                buffer_kwargs | self.replay_buffer_kwargs,
-            )  # SB3 refuses n_steps
+            self.replay_buffer_kwargs = self._replay_buffer_kwargs()
+            self.n_steps = 1  # SB3 would warn that it is ignored
         super()._setup_model()
         self.n_steps, self.replay_buffer_kwargs = given
         if self.compile:
@@ -197,6 +194,10 @@ class HAVESAC(SAC):
                 module.compile()
         if self.verbose >= 1:
             print(f"Image encoders compute in {self.critic.encoder.image_dtype(self.device)}")
+
+    def _replay_buffer_kwargs(self) -> dict[str, Any]:
+        """Of a ModalityReplayBuffer: what the user gave, and what follows from environment and algorithm."""
+        return {"n_stack": self.n_stack, "n_steps": self.n_steps, "gamma": self.gamma, **self.replay_buffer_kwargs}
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         self.policy.set_training_mode(True)
@@ -281,7 +282,10 @@ class HAVESAC(SAC):
         super().dump_logs()
 
     def _record_losses(self) -> None:
-        """Reads the losses, for which a GPU has to finish its work: so not in every update there."""
+        """
+        Reads the losses, for which a GPU has to finish its work: so there only for SB3's own dumps (``log_interval``),
+        not for those of callbacks.
+        """
         for name, loss in self._last_losses.items():
             self.logger.record(f"train/{name}", loss.item())
         self._last_losses = {}
@@ -338,8 +342,11 @@ class HAVESAC(SAC):
             goes on from there
         """
         super().load_replay_buffer(path, truncate_last_traj)
-        if truncate_last_traj and isinstance(self.replay_buffer, ModalityReplayBuffer):
-            self.replay_buffer.truncate_last_trajectory()
+        if isinstance(self.replay_buffer, ModalityReplayBuffer):
+            kwargs = self._replay_buffer_kwargs()
+            self.replay_buffer.n_steps, self.replay_buffer.gamma = kwargs["n_steps"], kwargs["gamma"]
+            if truncate_last_traj:
+                self.replay_buffer.truncate_last_trajectory()
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_last_losses"]
