@@ -192,7 +192,7 @@ class HAVESAC(SAC):
         if self.compile:
             for module in (*self.critic.children(), *self.critic_target.children(), *self.policy.auxiliary.values()):
                 module.compile()
-        if self.verbose >= 1:
+        if self.verbose >= 1 and _has_images(self.observation_space):
             print(f"Image encoders compute in {self.critic.encoder.image_dtype(self.device)}")
 
     def _replay_buffer_kwargs(self) -> dict[str, Any]:
