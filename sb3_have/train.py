@@ -256,9 +256,11 @@ class Run:
         algorithm = algorithms()[self.algo]
         if checkpoint is None:
             kwargs = model_kwargs(self.config)
-            if self.algo == "sac":  # as HAVESAC has by default, in a sixth of the memory
-                kwargs.setdefault("replay_buffer_class", ModalityReplayBuffer)
-                kwargs.setdefault("replay_buffer_kwargs", {"n_stack": stacked_frames(env)})
+            if self.algo == "sac" and "replay_buffer_class" not in kwargs:  # as HAVESAC has by default
+                derived = {"n_stack": stacked_frames(env), "n_steps": kwargs.pop("n_steps", 1)}
+                derived |= {"gamma": kwargs.get("gamma", 0.99)}
+                kwargs["replay_buffer_class"] = ModalityReplayBuffer
+                kwargs["replay_buffer_kwargs"] = derived | kwargs.get("replay_buffer_kwargs", {})
             return algorithm(env=env, seed=self.seed, device=self.device, **kwargs)
         model = algorithm.load(checkpoint / "model.zip", env=env, device=self.device)
         model.load_replay_buffer(checkpoint / "replay_buffer.pkl")
@@ -345,19 +347,22 @@ def _write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
 
 
 def hyperparameter(text: str) -> tuple[str, Any]:
-    """Name and value of ``name:value``, the value in YAML; 1e-3 is a number here, which in YAML it is not."""
+    """
+    Name and value of ``name:value``, the value in YAML, but for 1e-3 and 1e6, which are a float and an int here and in
+    YAML words.
+    """
     name, separator, value = text.partition(":")
     if not separator:
         raise argparse.ArgumentTypeError(f"expected NAME:VALUE, got {text!r}")
     try:
-        number = float(value)
-        return name, int(number) if number.is_integer() and "." not in value else number
-    except ValueError:
-        pass
-    try:
-        return name, yaml.safe_load(value)
+        parsed = yaml.safe_load(value)
     except yaml.YAMLError as error:
         raise argparse.ArgumentTypeError(f"{text!r} is not YAML behind the colon: {error}") from error
+    try:
+        number = float(parsed if isinstance(parsed, str) else "no word")
+    except ValueError:
+        return name, parsed
+    return name, int(number) if number.is_integer() else number
 
 
 def main(arguments: list[str] | None = None) -> None:

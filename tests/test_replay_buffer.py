@@ -648,3 +648,15 @@ def test_blocks_of_a_pool_that_grows(storage: str) -> None:
             assert np.array_equal(pool.gather("a", slots).numpy(), expected)
         assert pool.n_used == 1 + len(frames) if frames else pool.n_used <= 1
     assert len(pool._blocks) > 2
+
+
+def test_loaded_pool_grows_to_its_capacity() -> None:
+    pool = FramePool(20, {"a": (2,)}, {"a": np.dtype(np.uint8)})
+    for _ in range(17):
+        pool.take()
+    pool = pickle.loads(pickle.dumps(pool))
+    for _ in range(2):
+        pool.take()
+    assert pool._n_reserved == 20
+    pool.take()
+    assert pool._n_reserved > 20

@@ -82,9 +82,13 @@ def test_encoder_can_be_exported() -> None:
     encoder = MultiModalEncoder(space, features_dim=4, precision="float32")
     generator = th.Generator().manual_seed(0)
     observations = {key: th.randint(256, (2, 3, 36, 36), dtype=th.uint8, generator=generator) for key in space.spaces}
-    exported = th.export.export(encoder, (observations,)).module()
-    with th.no_grad():
-        th.testing.assert_close(exported(observations), encoder(observations))
+    batch = th.export.Dim("batch")
+    shapes = ({key: {0: batch} for key in space.spaces},)
+    exported = th.export.export(encoder, (observations,), dynamic_shapes=shapes).module()
+    for n in (1, 2):
+        given = {key: value[:n] for key, value in observations.items()}
+        with th.no_grad():
+            th.testing.assert_close(exported(given), encoder(given))
 
 
 def test_arithmetic_is_announced_once(capsys: pytest.CaptureFixture[str]) -> None:

@@ -177,10 +177,11 @@ class MultiModalEncoder(nn.Module):
             inputs = decoded[0] if len(decoded) == 1 else th.cat(decoded, dim=1)
             with th.autocast(observation.device.type, dtype=dtype, enabled=dtype != th.float32):
                 encoded = encoder(inputs)
-            if encoded.shape != (len(inputs), self.features_dim):
+            expected = (inputs.shape[0], self.features_dim)
+            if encoded.shape != expected:
                 raise ValueError(
                     f"modality {name!r}: {type(encoder).__name__} gave features of shape {tuple(encoded.shape)}, "
-                    f"expected {(len(inputs), self.features_dim)}; let it end in the `features_dim` units it is given."
+                    f"expected {expected}; let it end in the `features_dim` units it is given."
                 )
             features.append(encoded.float())
         return th.stack(features, dim=1)
@@ -194,6 +195,7 @@ class MultiModalEncoder(nn.Module):
         if not is_image:
             return observation.to(dtype).flatten(start_dim=1)
         signed = key in self.signed_keys
+        # the table is NumPy's, which no graph can hold
         traced = th.compiler.is_compiling() or th.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
         if self.normalize_images and observation.dtype == th.uint8 and observation.device.type == "cpu" and not traced:
             return _look_up(observation, signed, dtype)

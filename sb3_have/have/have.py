@@ -283,8 +283,8 @@ class HAVESAC(SAC):
 
     def _record_losses(self) -> None:
         """
-        Reads the losses, for which a GPU has to finish its work: so there only for SB3's own dumps (``log_interval``),
-        not for those of callbacks.
+        Reads the losses, for which a GPU has to finish its work: so there only in :meth:`dump_logs`, and not where a
+        callback dumps the logger itself, as EvalCallback does.
         """
         for name, loss in self._last_losses.items():
             self.logger.record(f"train/{name}", loss.item())
