@@ -57,7 +57,7 @@ def kind(run: str) -> str:
 
 def draw(out: Path, window: int = 20) -> None:
     """Distance in training, a running mean over ``window`` episodes, and in evaluations, beside other drivers."""
-    figure = Figure(figsize=(10, 4), layout="constrained")
+    figure = Figure(figsize=(10, 4.5), layout="constrained")
     FigureCanvasAgg(figure)
     training, evaluated = figure.subplots(1, 2, sharey=True)
     files = sorted(LEARNING.glob("monitor-*.csv"))
@@ -79,7 +79,7 @@ def draw(out: Path, window: int = 20) -> None:
     training.set(xlabel="environment steps in finished episodes", ylabel="distance [m]", ylim=(0, None))
     training.set_title(f"training, mean of {window} episodes")
     evaluated.set(xlabel="environment steps", title="evaluation, an episode in each weather")
-    evaluated.legend(fontsize="small")
+    figure.legend(*evaluated.get_legend_handles_labels(), fontsize="small", ncols=3, loc="outside lower center")
     figure.savefig(out, dpi=100)
     print(f"wrote {out}")
 
