@@ -1,11 +1,8 @@
 """ModalityReplayBuffer holds what SB3's buffers hold, whatever is added: properties of random streams."""
 
 import copy
-import errno
 import gc
-import os
 import pickle
-import warnings
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -39,7 +36,6 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_have import ModalityReplayBuffer
-from sb3_have.common.frames import EMPTY, FramePool
 
 GAMMAS = (0.5, 0.9, 0.99)
 # Without the time limit's flag beside no done, and obs always the last next_obs or a reset's after a done
@@ -594,69 +590,7 @@ def test_mmap_writes_where_it_is_told(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_directory_that_does_not_exist() -> None:
-    buffer = make(storage="mmap", mmap_dir="no/such/folder")
-    with pytest.raises(ValueError, match="mmap_dir='no/such/folder'"):
-        buffer.pool.take()
-
-
-def test_full_disk(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """As the system reports it; the message says what to do."""
-
-    def no_space(*args: Any) -> None:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr(os, "posix_fallocate", no_space, raising=False)
-    with pytest.raises(OSError, match=r"No space left.*'rgb'.*buffer_size.*mmap_dir") as error:
-        make(storage="mmap", mmap_dir=tmp_path).pool.take()
-    assert error.value.errno == errno.ENOSPC
-
-
-def test_no_memory() -> None:
-    pool = FramePool(10**10, {"rgb": (9, 128, 128)}, {"rgb": np.dtype(np.uint8)})
-    with pytest.raises(MemoryError, match=r"'rgb'.*buffer_size.*mmap"), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # that it will not do, where psutil is there to say so
-        pool.take()
-
-
 def test_images_of_no_whole_number_of_frames_are_kept_whole() -> None:
     """As when a wrapper beyond VecFrameStack adds a channel."""
     buffer = make(observation_space=spaces.Dict({"rgb": spaces.Box(0, 255, (10, 16, 16), np.uint8)}), n_stack=3)
     assert buffer.stacked_keys == [] and buffer.pool.shapes["rgb"] == (10, 16, 16)
-
-
-@pytest.mark.parametrize("storage", ["memory", "mmap", "device"])
-def test_blocks_of_a_pool_that_grows(storage: str) -> None:
-    """Frames stay where they are, whatever is taken, given back, saved and loaded in between."""
-    rng = np.random.default_rng(0)
-    pool = FramePool(4, {"a": (2, 3)}, {"a": np.dtype(np.int16)}, storage)
-    frames: dict[int, np.ndarray] = {}
-    for turn in range(200):
-        if turn % 50 == 49:
-            pool = pickle.loads(pickle.dumps(pool))
-        for slot in rng.permutation(list(frames))[: rng.integers(0, 3)].tolist():
-            pool.give_back([slot])
-            del frames[slot]
-        for _ in range(rng.integers(0, 4)):
-            slot = pool.take()
-            assert slot not in frames and slot != EMPTY
-            frames[slot] = rng.integers(-9, 9, (2, 3)).astype(np.int16)
-            pool.write(slot, {"a": frames[slot]})
-        slots = np.array([EMPTY, *frames], np.int32)
-        if frames:
-            expected = np.stack([np.zeros((2, 3)), *frames.values()])
-            assert np.array_equal(pool.gather("a", slots).numpy(), expected)
-        assert pool.n_used == 1 + len(frames) if frames else pool.n_used <= 1
-    assert len(pool._blocks) > 2
-
-
-def test_loaded_pool_grows_to_its_capacity() -> None:
-    pool = FramePool(20, {"a": (2,)}, {"a": np.dtype(np.uint8)})
-    for _ in range(17):
-        pool.take()
-    pool = pickle.loads(pickle.dumps(pool))
-    for _ in range(2):
-        pool.take()
-    assert pool._n_reserved == 20
-    pool.take()
-    assert pool._n_reserved > 20
