@@ -2,11 +2,11 @@
 
 import hashlib
 import itertools
+import os
 import pickle
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as check_gymnasium_env
-from highway_env.envs.common.observation import ObservationType
 from highway_env.vehicle.behavior import IDMVehicle
 from stable_baselines3.common.env_checker import check_env as check_sb3_env
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
+from benchmarks.road_identity import BlindEnv
 from sb3_have.envs import HighwayVisionEnv, traffic
 from sb3_have.envs.road import LANE_WIDTH
 from sb3_have.envs.weather import WEATHERS
@@ -27,23 +27,6 @@ MODALITIES = ("rgb", "event", "depth")
 SUBSETS = [subset for n in (1, 2, 3) for subset in itertools.combinations(MODALITIES, n)]
 INFO_KEYS = {"distance", "speed", "crashed", "offroad", "weather", "end_reason"}
 STRAIGHT = np.zeros(2, dtype=np.float32)
-
-
-class NoObservation(ObservationType):  # type: ignore[misc]  # highway-env is untyped
-    def space(self) -> spaces.Box:
-        return spaces.Box(0, 1, (1,), np.float32)
-
-    def observe(self) -> np.ndarray:
-        return np.zeros(1, np.float32)
-
-
-class BlindEnv(HighwayVisionEnv):
-    """The dynamics alone: no sensors are rendered."""
-
-    def define_spaces(self) -> None:
-        super().define_spaces()
-        self.observation_type = NoObservation(self)
-        self.observation_space = self.observation_type.space()
 
 
 def rollout_digest(seed: int, steps: int, **kwargs: Any) -> str:
@@ -348,9 +331,8 @@ def test_same_seed_same_bits_in_one_process_and_in_another() -> None:
     assert here == rollout_digest(3, 20)
     assert here != rollout_digest(4, 20)
     code = "from test_highway_vision import rollout_digest; print(rollout_digest(3, 20))"
-    there = subprocess.run(
-        [sys.executable, "-c", code], cwd=Path(__file__).parent, capture_output=True, text=True, check=True
-    )
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    there = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert there.stdout.strip() == here
 
 

@@ -59,8 +59,8 @@ class HAVESAC(SAC):
         and actor alike, never all of them
     :param auxiliary: "deepmdp", None, or ``{name: AuxiliaryLoss class}`` ("deepmdp" included where wanted): the
         auxiliary losses that are trained, with coefficient 1 (see :class:`~sb3_have.DeepMDPCallback`)
-    :param compile: whether to compile encoders, critics and auxiliary heads by ``torch.nn.Module.compile``; worth it
-        on CUDA, and on a CPU only for long runs
+    :param compile: whether to compile encoders, critics and auxiliary heads by ``torch.nn.Module.compile``, which
+        takes minutes; meant for CUDA, where it has not been tried yet
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
