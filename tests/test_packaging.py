@@ -27,13 +27,13 @@ def test_every_package_directory_is_listed() -> None:
     assert (ROOT / "sb3_have" / "py.typed").is_file()
 
 
-@pytest.mark.parametrize("section", ["options", "dev"])
+@pytest.mark.parametrize("section", ["options", "dev", "events", "carla", "mujoco"])
 def test_every_direct_dependency_is_pinned(section: str) -> None:
     config = configparser.ConfigParser()
     config.read(ROOT / "setup.cfg")
-    text = config["options"]["install_requires"] if section == "options" else config["options.extras_require"]["dev"]
+    text = config["options"]["install_requires"] if section == "options" else config["options.extras_require"][section]
     lines = [line for line in text.splitlines() if line and not line.startswith("#")]
-    needed = {re.split(r"[<>=]", line)[0].lower().replace("_", "-") for line in lines}
+    needed = {re.split(r"[<>=;\[]", line)[0].lower().replace("_", "-") for line in lines}
     pins = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
     assert needed <= {pin.split("==")[0].lower().replace("_", "-") for pin in pins}
     assert not [pin for pin in pins if "+" in pin or "@" in pin], "local versions and URLs install on one machine only"
