@@ -18,7 +18,6 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from copy import deepcopy
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -26,7 +25,6 @@ from typing import Any
 
 import gymnasium as gym
 import pandas as pd
-import yaml
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
@@ -38,6 +36,7 @@ import sb3_have
 from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
 from sb3_have.common.evaluation import evaluate, leave_interrupts_to_parent
 from sb3_have.common.memory import keep_freed_memory
+from sb3_have.configuration import env_wrapper, evaluation_env_kwargs, hyperparameter, load_config, model_kwargs
 from sb3_have.envs.weather import WEATHERS
 
 EVALUATION_SEED = 1_000_000
@@ -49,45 +48,18 @@ def algorithms() -> dict[str, type[OffPolicyAlgorithm]]:
     return {"havesac": sb3_have.HAVESAC, "sac": SAC}
 
 
-def config_path(name: str) -> Path:
-    """File of a configuration.
-
-    :param name: of a file, or of one in ``zoo_configs`` without its ending ("havesac")
-    :raises FileNotFoundError: if there is neither
-    """
-    package = Path(__file__).parent
-    # zoo_configs lies inside the package in a wheel and beside it in a checkout
-    candidates = [Path(name), package / "zoo_configs" / f"{name}.yml", package.parent / "zoo_configs" / f"{name}.yml"]
-    for path in candidates:
-        if path.is_file():
-            return path
-    raise FileNotFoundError(f"no configuration {name!r}; looked for {', '.join(map(str, candidates))}")
-
-
-def load_config(name: str, env_id: str) -> dict[str, Any]:
-    """Hyper-parameters for an environment, in the format of the RL Zoo.
-
-    :param name: see :func:`config_path`
-    :param env_id: key of the block to read
-    :raises KeyError: if the file has no block for it
-    """
-    path = config_path(name)
-    blocks = yaml.safe_load(path.read_text())
-    if env_id not in blocks:
-        raise KeyError(f"{path} has no block for {env_id!r}, only for {', '.join(blocks)}")
-    return dict(blocks[env_id])
-
-
 def make_training_env(env_id: str, config: Mapping[str, Any], out: Path | None = None) -> VecEnv:
     """The environments of a configuration, with their frame stack.
 
-    :param config: ``env_kwargs``, ``frame_stack`` and ``n_envs`` are used; several run in processes of their own
+    :param config: ``env_kwargs``, ``env_wrapper``, ``frame_stack`` and ``n_envs`` are used; several run in processes of
+        their own
     :param out: folder in whose ``monitor.csv`` (``<i>.monitor.csv`` for several) the episodes are appended
     """
 
     def make(index: int) -> gym.Env[Any, Any]:
         leave_interrupts_to_parent()
         env = gym.make(env_id, **config.get("env_kwargs", {}))
+        env = env if wrapper is None else wrapper(env)
         told = env.reset()[1]
         keywords = tuple(key for key in ("distance", "weather", "end_reason") if key in told)
         if out is None:
@@ -95,22 +67,10 @@ def make_training_env(env_id: str, config: Mapping[str, Any], out: Path | None =
         file = out / (f"{index}.monitor.csv" if n_envs > 1 else "monitor.csv")
         return Monitor(env, str(file), info_keywords=keywords, override_existing=not file.exists())
 
-    n_envs = config.get("n_envs", 1)
+    n_envs, wrapper = config.get("n_envs", 1), env_wrapper(config)
     makers: list[Callable[[], gym.Env[Any, Any]]] = [partial(make, index) for index in range(n_envs)]
     vec_env: VecEnv = SubprocVecEnv(makers) if n_envs > 1 else DummyVecEnv(makers)
     return VecFrameStack(vec_env, config["frame_stack"]) if config.get("frame_stack", 1) > 1 else vec_env
-
-
-def evaluation_env_kwargs(config: Mapping[str, Any]) -> dict[str, Any]:
-    """The ``env_kwargs`` of a configuration without the weather, which :func:`evaluate` sets itself."""
-    return {key: value for key, value in config.get("env_kwargs", {}).items() if key != "weather"}
-
-
-def model_kwargs(config: Mapping[str, Any]) -> dict[str, Any]:
-    """What of a configuration goes to the algorithm's constructor."""
-    for_others = {"n_timesteps", "n_envs", "frame_stack", "env_kwargs"}
-    # copied, because SB3 writes into policy_kwargs
-    return {key: deepcopy(value) for key, value in config.items() if key not in for_others}
 
 
 class RunCallback(BaseCallback):
@@ -317,6 +277,7 @@ class Run:
             EVALUATION_SEED,
             evaluation_env_kwargs(self.config),
             n_envs=self.eval_envs,
+            env_wrapper=env_wrapper(self.config),
         )
         frame.insert(0, "step", step)
         frame.insert(1, "seed", self.seed)
@@ -344,25 +305,6 @@ def _write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
     partial = path.with_name(f"partial-{path.name}")
     write(partial)
     partial.replace(path)
-
-
-def hyperparameter(text: str) -> tuple[str, Any]:
-    """
-    Name and value of ``name:value``, the value in YAML, but for 1e-3 and 1e6, which are a float and an int here and in
-    YAML words.
-    """
-    name, separator, value = text.partition(":")
-    if not separator:
-        raise argparse.ArgumentTypeError(f"expected NAME:VALUE, got {text!r}")
-    try:
-        parsed = yaml.safe_load(value)
-    except yaml.YAMLError as error:
-        raise argparse.ArgumentTypeError(f"{text!r} is not YAML behind the colon: {error}") from error
-    try:
-        number = float(parsed if isinstance(parsed, str) else "no word")
-    except ValueError:
-        return name, parsed
-    return name, int(number) if number.is_integer() else number
 
 
 def main(arguments: list[str] | None = None) -> None:

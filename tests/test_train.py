@@ -12,7 +12,8 @@ from fake_drive import ENV_ID
 
 import sb3_have
 from sb3_have import train
-from sb3_have.train import Run, config_path, load_config, model_kwargs, newest_checkpoint
+from sb3_have.configuration import load_config, model_kwargs
+from sb3_have.train import Run, newest_checkpoint
 
 CONFIG: dict[str, Any] = {
     "n_timesteps": 100,
@@ -109,13 +110,6 @@ def test_time_limit(tmp_path: Path) -> None:
     assert not run.interrupted
 
 
-def test_constructor_gets_a_copy_of_what_concerns_it() -> None:
-    kwargs = model_kwargs({**CONFIG, "n_envs": 2})
-    assert set(CONFIG) - set(kwargs) == {"n_timesteps", "frame_stack", "env_kwargs"} and "n_envs" not in kwargs
-    kwargs["policy_kwargs"]["net_arch"].append(1)
-    assert CONFIG["policy_kwargs"]["net_arch"] == [8]
-
-
 def test_several_environments(tmp_path: Path) -> None:
     run = Run({**CONFIG, "n_envs": 2}, ENV_ID, tmp_path, algo="sac", eval_freq=15, eval_episodes=1, weathers=["slow"])
     assert run.train(30).num_timesteps == 30
@@ -132,10 +126,3 @@ def test_shipped_configuration_fits_havesac() -> None:
     shapes = {key: space.shape for key, space in model.observation_space.spaces.items()}  # type: ignore[attr-defined]
     assert shapes == {"rgb": (9, 64, 64), "event": (15, 64, 64), "depth": (3, 64, 64)}
     env.close()
-
-
-def test_unknown_configuration_is_explained() -> None:
-    with pytest.raises(FileNotFoundError, match=r"nothing.*zoo_configs"):
-        config_path("nothing")
-    with pytest.raises(KeyError, match=r"Pendulum-v1.*only for HighwayVision-v0"):
-        load_config("havesac", "Pendulum-v1")

@@ -1,6 +1,5 @@
 """How a training step is carried out: how often, in which arithmetic, what waits for what (losses: test_have_math)."""
 
-import argparse
 import subprocess
 import sys
 from typing import Any
@@ -15,7 +14,6 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_have import HAVESAC, ModalityReplayBuffer
 from sb3_have.common.encoders import MultiModalEncoder, decode_bytes
-from sb3_have.train import hyperparameter
 
 # -- Schedules
 
@@ -246,14 +244,3 @@ print(faults[-1] - faults[0])
     if results["keep"].returncode == 3:
         pytest.skip("the C library has no mallopt")
     assert int(results["keep"].stdout) < 100 < int(results["default"].stdout), results
-
-
-def test_hyperparameters_of_the_command_line() -> None:
-    assert hyperparameter("learning_rate:3e-4") == ("learning_rate", 3e-4)
-    for text, value in (("32", 32), ("1e5", 100_000), ("1.0", 1.0), ("0.5", 0.5)):
-        assert hyperparameter(f"x:{text}") == ("x", value) and type(hyperparameter(f"x:{text}")[1]) is type(value)
-    assert hyperparameter("ent_coef:auto_0.1") == ("ent_coef", "auto_0.1")
-    assert hyperparameter("policy_kwargs:{precision: float32}") == ("policy_kwargs", {"precision": "float32"})
-    for text, message in (("gamma", "NAME:VALUE"), ("net_arch:[64", "not YAML")):
-        with pytest.raises(argparse.ArgumentTypeError, match=message):
-            hyperparameter(text)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import signal
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -46,6 +46,7 @@ def evaluate(
     n_envs: int = 1,
     deterministic: bool = True,
     progress_bar: bool = False,
+    env_wrapper: Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] | None = None,
 ) -> pd.DataFrame:
     """Return and distance of a driver in each weather.
 
@@ -60,13 +61,15 @@ def evaluate(
     :param n_envs: environments at a time, each in a process of its own when there are several
     :param deterministic: whether the policy's mode is driven rather than a sample of it
     :param progress_bar: shown per episode
+    :param env_wrapper: applied to every environment, e.g. ``partial(SensorFailure, modality="rgb", kind="black")``; a
+        function or class that can be pickled if there are several environments
     :return: a row per weather: ``weather, episodes, return_mean, return_std, distance_mean, distance_std`` [m],
         ``steps_mean, crash_share, offroad_share`` (0..1). Standard deviations are over episodes (ddof=0, as SB3's);
         what the environment's ``info`` does not tell (``distance, crashed, offroad``) is NaN
     :raises ValueError: if the model's observation space cannot be made from the environment's, or counts are < 1
     """
     episodes = evaluate_episodes(
-        model, env_id, weathers, n_episodes, seed, env_kwargs, n_envs, deterministic, progress_bar
+        model, env_id, weathers, n_episodes, seed, env_kwargs, n_envs, deterministic, progress_bar, env_wrapper
     )
     return summarize(episodes)
 
@@ -81,6 +84,7 @@ def evaluate_episodes(
     n_envs: int = 1,
     deterministic: bool = True,
     progress_bar: bool = False,
+    env_wrapper: Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] | None = None,
 ) -> pd.DataFrame:
     """The single episodes behind :func:`evaluate`, which has the same parameters.
 
@@ -95,7 +99,7 @@ def evaluate_episodes(
     n_envs = min(n_envs, len(tasks))
     # A fixed share for each environment: taking whatever ends first would favour short episodes.
     shares = [tasks[i::n_envs] for i in range(n_envs)]
-    makers = [partial(EpisodeQueue, env_id, share, dict(env_kwargs or {})) for share in shares]
+    makers = [partial(EpisodeQueue, env_id, share, dict(env_kwargs or {}), env_wrapper) for share in shares]
     vec_env: VecEnv = SubprocVecEnv(makers) if n_envs > 1 else DummyVecEnv(makers)  # type: ignore[arg-type]
     try:
         vec_env = match_observations(vec_env, model)
@@ -194,10 +198,18 @@ class EpisodeQueue(gym.Env[Any, Any]):
     :param env_id: of the environment, made anew when the weather changes
     :param tasks: weather and seed of each episode
     :param env_kwargs: further keywords for ``gym.make``
+    :param env_wrapper: applied to each environment that is made
     """
 
-    def __init__(self, env_id: str, tasks: Sequence[Task], env_kwargs: Mapping[str, Any]) -> None:
+    def __init__(
+        self,
+        env_id: str,
+        tasks: Sequence[Task],
+        env_kwargs: Mapping[str, Any],
+        env_wrapper: Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] | None = None,
+    ) -> None:
         leave_interrupts_to_parent()
+        self._env_wrapper = env_wrapper
         self._env_id, self._tasks, self._env_kwargs = env_id, list(tasks), dict(env_kwargs)
         self._next, self._weather = 0, ""
         self._make(self._tasks[0].weather)
@@ -208,7 +220,8 @@ class EpisodeQueue(gym.Env[Any, Any]):
         if weather != self._weather:
             if self._weather:
                 self._env.close()
-            self._env: gym.Env[Any, Any] = gym.make(self._env_id, weather=weather, **self._env_kwargs)
+            env: gym.Env[Any, Any] = gym.make(self._env_id, weather=weather, **self._env_kwargs)
+            self._env = env if self._env_wrapper is None else self._env_wrapper(env)
             self._weather = weather
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:

@@ -1,0 +1,122 @@
+"""Configurations in the format of the RL Zoo: a YAML file with a block of hyper-parameters per environment."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import yaml
+
+Env = gym.Env[Any, Any]
+
+
+def config_path(name: str) -> Path:
+    """File of a configuration.
+
+    :param name: of a file, or of one in ``zoo_configs`` without its ending ("havesac")
+    :raises FileNotFoundError: if there is neither
+    """
+    package = Path(__file__).parent
+    # zoo_configs lies inside the package in a wheel and beside it in a checkout
+    candidates = [Path(name), package / "zoo_configs" / f"{name}.yml", package.parent / "zoo_configs" / f"{name}.yml"]
+    for path in candidates:
+        if path.is_file():
+            return path
+    raise FileNotFoundError(f"no configuration {name!r}; looked for {', '.join(map(str, candidates))}")
+
+
+def load_config(name: str, env_id: str) -> dict[str, Any]:
+    """Hyper-parameters for an environment.
+
+    :param name: see :func:`config_path`
+    :param env_id: key of the block to read
+    :raises KeyError: if the file has no block for it
+    """
+    path = config_path(name)
+    blocks = yaml.safe_load(path.read_text())
+    if env_id not in blocks:
+        raise KeyError(f"{path} has no block for {env_id!r}, only for {', '.join(blocks)}")
+    return dict(blocks[env_id])
+
+
+def evaluation_env_kwargs(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The ``env_kwargs`` of a configuration without the weather, which :func:`sb3_have.evaluate` sets itself."""
+    return {key: value for key, value in config.get("env_kwargs", {}).items() if key != "weather"}
+
+
+def model_kwargs(config: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a configuration goes to the algorithm's constructor."""
+    for_others = {"n_timesteps", "n_envs", "frame_stack", "env_kwargs", "env_wrapper"}
+    # copied, because SB3 writes into policy_kwargs
+    return {key: deepcopy(value) for key, value in config.items() if key not in for_others}
+
+
+def env_wrapper(config: Mapping[str, Any]) -> Callable[[Env], Env] | None:
+    """The ``env_wrapper`` of a configuration as one function, or None.
+
+    As in the Zoo it is a dotted path, a mapping of a dotted path to keywords, or a list of such, innermost first::
+
+        env_wrapper:
+          - sb3_have.sensors.SensorFailure:
+              modality: rgb
+              kind: black
+              probability: 0.1
+              per: episode
+          - gymnasium.wrappers.RecordEpisodeStatistics
+
+    :return: can be pickled, so that it reaches the workers of ``SubprocVecEnv``
+    :raises ValueError: if an entry has another form or its path leads nowhere
+    """
+    given = config.get("env_wrapper")
+    if given is None:
+        return None
+    wrappers = []
+    for entry in given if isinstance(given, list) else [given]:
+        if isinstance(entry, Mapping) and len(entry) == 1:
+            path, kwargs = next(iter(entry.items()))
+        else:
+            path, kwargs = entry, None
+        if not isinstance(path, str) or not isinstance(kwargs, Mapping | None):
+            raise ValueError(f"an env_wrapper is 'module.Class' or 'module.Class: {{keyword: value}}', got {entry!r}")
+        wrappers.append((_locate(path), dict(kwargs or {})))
+    return partial(_wrap, wrappers)
+
+
+def _wrap(wrappers: list[tuple[Callable[..., Env], dict[str, Any]]], env: Env) -> Env:
+    for wrapper, kwargs in wrappers:
+        env = wrapper(env, **kwargs)
+    return env
+
+
+def _locate(path: str) -> Callable[..., Env]:
+    module, _, name = path.rpartition(".")
+    try:
+        wrapper: Callable[..., Env] = getattr(import_module(module), name)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise ValueError(f"there is no env_wrapper {path!r}: {error}") from error
+    return wrapper
+
+
+def hyperparameter(text: str) -> tuple[str, Any]:
+    """
+    Name and value of ``name:value``, the value in YAML, but for 1e-3 and 1e6, which are a float and an int here and in
+    YAML words.
+    """
+    name, separator, value = text.partition(":")
+    if not separator:
+        raise argparse.ArgumentTypeError(f"expected NAME:VALUE, got {text!r}")
+    try:
+        parsed = yaml.safe_load(value)
+    except yaml.YAMLError as error:
+        raise argparse.ArgumentTypeError(f"{text!r} is not YAML behind the colon: {error}") from error
+    try:
+        number = float(parsed if isinstance(parsed, str) else "no word")
+    except ValueError:
+        return name, parsed
+    return name, int(number) if number.is_integer() else number
