@@ -209,6 +209,7 @@ class EpisodeQueue(gym.Env[Any, Any]):
         env_wrapper: Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] | None = None,
     ) -> None:
         leave_interrupts_to_parent()
+        self._env: gym.Env[Any, Any]
         self._env_wrapper = env_wrapper
         self._env_id, self._tasks, self._env_kwargs = env_id, list(tasks), dict(env_kwargs)
         self._next, self._weather = 0, ""
