@@ -5,22 +5,54 @@ contrast threshold the pixel fires an event, and the reference moves by that thr
 brightness is taken as linear in time, so a fast change gives several events, each with its own time stamp
 (Rebecq et al., "ESIM: an Open Event Camera Simulator", CoRL 2018). Noise follows Hu et al., "v2e: From Video
 Frames to Realistic DVS Events", CVPRW 2021.
+
+From one frame to the next, in this order: the mapped intensity, the low-pass filter of the photoreceptor, the leak,
+the crossings of the straight line between the two levels, shot noise, the refractory period.
 """
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+from collections import abc
+from types import MappingProxyType
+from typing import Any, Final, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Mapping = Literal["log", "lin_log", "identity"]
 
-#: One event: column, row, time in seconds, polarity +1 (brighter) or -1 (darker).
+#: One event: column, row, time in seconds, polarity +1 (brighter) or -1 (darker). Environments count in seconds, and in
+#: float64 neighbouring times lie less than a nanosecond apart for the first 97 days; files of recorded events count in
+#: whole micro- or nanoseconds.
 EVENT_DTYPE = np.dtype([("x", np.uint16), ("y", np.uint16), ("t", np.float64), ("p", np.int8)])
 
 #: v2e's lin-log mapping is linear below this many digital numbers, where the noise of an 8-bit frame is one threshold.
 LIN_LOG_KNEE = 20.0
+
+#: Parameters of :class:`EventCamera` by name, for :meth:`EventCamera.preset`.
+#:
+#: - ``"ideal"``: no noise, no mismatch. Frames of linear light, white at about 1.
+#: - ``"carla"``: the defaults of CARLA 0.9.16's ``sensor.camera.dvs`` (its reference of sensors). Frames as there, the
+#:   8-bit grey image over 255 with grey = 0.2989 R + 0.5870 G + 0.1140 B. Time stamps are those of this module.
+#: - ``"noisy"``: v2e's option ``--dvs_params noisy``. Frames in digital numbers 0..255. Other than in v2e, shot noise
+#:   does not depend on the light, leaks have no jitter, and the bandwidth is the same in the dark unless
+#:   ``cutoff_intensity=255`` is added.
+PRESETS: Final[abc.Mapping[str, abc.Mapping[str, Any]]] = MappingProxyType(
+    {
+        "ideal": MappingProxyType({"threshold": 0.2, "mapping": "log", "log_eps": 1e-3}),
+        "carla": MappingProxyType({"threshold": (0.3, 0.3), "mapping": "log", "log_eps": 1e-3}),
+        "noisy": MappingProxyType(
+            {
+                "threshold": 0.2,
+                "threshold_sigma": 0.05,
+                "leak_rate": 0.1,
+                "shot_rate": 5.0,
+                "mapping": "lin_log",
+                "cutoff_hz": 30.0,
+            }
+        ),
+    }
+)
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -46,6 +78,12 @@ class EventCamera:
     :param mapping: ``"log"``: log(log_eps + I); ``"lin_log"``: v2e's mapping of numbers 0..255, linear below 20;
         ``"identity"``: the frame is taken as it is (it may already be a logarithm).
     :param log_eps: Added to the intensity before the logarithm; it sets how dark the sensor still sees.
+    :param cutoff_hz: Bandwidth of the photoreceptor in Hz: its mapped intensity passes a low-pass filter of first
+        order, time constant 1 / (2 pi cutoff_hz), exact for an input that is linear in time between the frames. None
+        is an unlimited bandwidth.
+    :param cutoff_intensity: Intensity from which on the bandwidth is ``cutoff_hz``. In less light it shrinks in
+        proportion, to no less than a tenth, as in v2e. The intensity is the new frame's, so how finely a film is cut
+        into frames then makes a small difference. None: the same bandwidth in any light.
     :param seed: Seed of the threshold mismatch, the leak phases and the noise.
     :raises ValueError: on a parameter out of its range.
     """
@@ -61,6 +99,8 @@ class EventCamera:
         shot_rate: float = 0.0,
         mapping: Mapping = "log",
         log_eps: float = 1e-3,
+        cutoff_hz: float | None = None,
+        cutoff_intensity: float | None = None,
         seed: int | None = None,
     ) -> None:
         if height < 1 or width < 1 or max(height, width) > np.iinfo(np.uint16).max:
@@ -82,6 +122,15 @@ class EventCamera:
             raise ValueError(f"mapping must be one of {get_args(Mapping)}, got {mapping!r}")
         if mapping == "log" and not log_eps > 0:
             raise ValueError(f"log_eps must be > 0, got {log_eps!r}")
+        if cutoff_hz is not None and not 0 < cutoff_hz < np.inf:
+            raise ValueError(f"cutoff_hz must be a finite number > 0, or None for no filter, got {cutoff_hz!r}")
+        if cutoff_intensity is not None and (
+            cutoff_hz is None or mapping == "identity" or not 0 < cutoff_intensity < np.inf
+        ):
+            raise ValueError(
+                f"cutoff_intensity must be a finite number > 0, got {cutoff_intensity!r}, and needs a cutoff_hz and a "
+                f"mapping of intensities ('log' or 'lin_log'), got {cutoff_hz!r} and {mapping!r}"
+            )
 
         self.height, self.width = height, width
         self.threshold_sigma = threshold_sigma
@@ -90,6 +139,8 @@ class EventCamera:
         self.shot_rate = shot_rate
         self.mapping = mapping
         self.log_eps = log_eps
+        self.cutoff_hz = cutoff_hz
+        self.cutoff_intensity = cutoff_intensity
         self._rng = np.random.default_rng(seed)
         mismatch = self._rng.standard_normal((2, height * width)) * threshold_sigma
         #: Thresholds of every pixel, shape (2, height * width): positive, negative.
@@ -98,10 +149,28 @@ class EventCamera:
         self._leak_phase: FloatArray = self._rng.random(height * width) if leak_rate else np.zeros(height * width)
         self.reset()
 
+    @classmethod
+    def preset(cls, name: str, height: int, width: int, **overrides: Any) -> EventCamera:
+        """
+        A camera with the parameters of :data:`PRESETS`, which says what frames each expects.
+
+        :param name: ``"ideal"``, ``"carla"`` or ``"noisy"``.
+        :param height: Rows of the sensor.
+        :param width: Columns of the sensor.
+        :param overrides: Parameters of :class:`EventCamera` in place of or beside those of the preset.
+        :raises ValueError: on an unknown name or a parameter out of its range.
+        """
+        if name not in PRESETS:
+            raise ValueError(f"preset must be one of {tuple(PRESETS)}, got {name!r}")
+        return cls(height, width, **{**PRESETS[name], **overrides})
+
     def reset(self) -> None:
         """Forget the scene: the next frame only sets the reference. The thresholds and leak phases stay."""
         self._time: float | None = None
         self._start = 0.0
+        # Mapped intensity, the same behind the low-pass filter, and with the leak on top: what crosses thresholds.
+        self._input: FloatArray = np.zeros(self.height * self.width)
+        self._filtered: FloatArray = np.zeros(self.height * self.width)
         self._level: FloatArray = np.zeros(self.height * self.width)
         self._reference: FloatArray = np.zeros(self.height * self.width)
         self._last_event: FloatArray = np.full(self.height * self.width, -np.inf)
@@ -113,7 +182,8 @@ class EventCamera:
         :param frame: Intensity >= 0 of shape (height, width) (any real number for ``mapping="identity"``).
         :param t: Time of the frame in seconds, later than the previous one.
         :return: Structured array with fields x, y, t, p, sorted by time; empty for the first frame after a reset.
-        :raises ValueError: on a wrong shape, a negative or non-finite intensity, or a time that does not advance.
+        :raises ValueError: on a wrong shape, a negative or non-finite intensity, or a time that does not advance. The
+            camera is then as before the call.
         """
         pixel, times, polarity = self.detect(frame, t)
         order = np.argsort(times, kind="stable")
@@ -132,13 +202,20 @@ class EventCamera:
         :param rng: Source of the shot noise in place of the camera's own.
         :return: Pixel index (row * width + column), time in seconds and polarity (+1.0 or -1.0) of every event.
         """
-        level = self._map(frame)
+        intensity = self._check(frame)
+        level = mapped = self._map(intensity)
         if self._time is None:
+            if not np.isfinite(t):
+                raise ValueError(f"t must be a finite number of seconds, got {t!r}")
             self._time = self._start = t
-            self._level, self._reference = level, level - self._leak_phase * self.thresholds[0]
+            self._input = self._filtered = self._level = level
+            self._reference = level - self._leak_phase * self.thresholds[0]
             return np.empty(0, np.int64), np.empty(0), np.empty(0)
-        if not t > self._time:
+        if not self._time < t < np.inf:
             raise ValueError(f"time must advance: got t={t!r} after t={self._time!r}; call reset() to start anew")
+        if self.cutoff_hz is not None:
+            level = self._low_pass(mapped, intensity, t - self._time)
+            self._input, self._filtered = mapped, level
         if self.leak_rate:
             # A reference that sinks steadily is the same as a brightness that rises steadily.
             level = level + self.thresholds[0] * (self.leak_rate * (t - self._start))
@@ -155,23 +232,38 @@ class EventCamera:
         self._level, self._time = level, t
         return events
 
-    def _map(self, frame: ArrayLike) -> FloatArray:
+    def _check(self, frame: ArrayLike) -> FloatArray:
+        """The frame as one row of numbers that the mapping takes."""
         intensity = np.asarray(frame, dtype=np.float64)
         if intensity.shape != (self.height, self.width):
-            raise ValueError(f"frame must have shape {(self.height, self.width)}, got {intensity.shape}")
-        intensity = intensity.reshape(-1)
+            raise ValueError(
+                f"frame must have shape {(self.height, self.width)}, got {intensity.shape}; give one grey image, or "
+                "make a camera of this size"
+            )
         if not np.isfinite(intensity).all():
-            raise ValueError("frame holds NaN or infinite intensities")
-        if self.mapping == "identity":
-            return intensity.copy()
-        if intensity.min() < 0:
+            raise ValueError("frame holds NaN or infinite intensities; replace them, np.nan_to_num does")
+        if self.mapping != "identity" and intensity.min() < 0:
             raise ValueError(
                 f"frame must be >= 0, got a minimum of {intensity.min()!r}; use mapping='identity' for logs"
             )
+        return intensity.reshape(-1)
+
+    def _map(self, intensity: FloatArray) -> FloatArray:
+        if self.mapping == "identity":
+            return intensity.copy()
         if self.mapping == "log":
             return np.log(intensity + self.log_eps)
         linear = intensity * (np.log(LIN_LOG_KNEE) / LIN_LOG_KNEE)
         return np.where(intensity <= LIN_LOG_KNEE, linear, np.log(np.maximum(intensity, LIN_LOG_KNEE)))
+
+    def _low_pass(self, mapped: FloatArray, intensity: FloatArray, dt: float) -> FloatArray:
+        """Where the filter stands after its input went straight from its previous value to ``mapped``."""
+        assert self.cutoff_hz is not None
+        tau: float | FloatArray = 1 / (2 * np.pi * self.cutoff_hz)
+        if self.cutoff_intensity is not None:
+            tau = tau / np.clip(intensity / self.cutoff_intensity, 0.1, 1)
+        lag = (mapped - self._input) / dt * tau  # behind a ramp, once it has settled
+        return np.asarray(mapped - lag + (self._filtered - self._input + lag) * np.exp(-dt / tau))
 
     def _crossings(self, level: FloatArray, t0: float, t1: float) -> Events:
         """Every threshold crossing on the straight line from the previous level to this one."""
@@ -205,14 +297,26 @@ class EventCamera:
 
     def _drop_refractory(self, pixel: IntArray, times: FloatArray, polarity: FloatArray) -> Events:
         """Drop the events that fall into their pixel's dead time; only an event that is kept starts a new one."""
-        order = np.lexsort((times, pixel))
+        order = _by_pixel(pixel, times)
         pixel, times, polarity = pixel[order], times[order], polarity[order]
         first = np.flatnonzero(np.diff(pixel, prepend=-1))
         rank = np.arange(len(pixel)) - np.repeat(first, np.diff(np.append(first, len(pixel))))
+        # The first event of every pixel, the second of those that have one, and so on: each event is visited once.
+        rounds = np.split(np.argsort(rank, kind="stable"), np.cumsum(np.bincount(rank)))
         keep = np.zeros(len(pixel), dtype=bool)
-        for nth in range(int(rank.max(initial=-1)) + 1):
-            nth_event = np.flatnonzero(rank == nth)
+        for nth_event in rounds:
             alive = nth_event[times[nth_event] - self._last_event[pixel[nth_event]] >= self.refractory]
             keep[alive] = True
             self._last_event[pixel[alive]] = times[alive]
         return pixel[keep], times[keep], polarity[keep]
+
+
+def _by_pixel(pixel: IntArray, times: FloatArray) -> IntArray:
+    """``np.lexsort((times, pixel))``, faster where the events of most pixels are in order already: crossings are."""
+    order = np.argsort(pixel, kind="stable")
+    late = (np.diff(times[order]) < 0) & (np.diff(pixel[order]) == 0)
+    if late.any():
+        mixed = np.flatnonzero(np.isin(pixel[order], pixel[order][1:][late]))
+        part = order[mixed]
+        order[mixed] = part[np.lexsort((times[part], pixel[part]))]
+    return order
