@@ -1,17 +1,34 @@
 """Simulated sensors and the 8-bit forms in which their images travel."""
 
 from sb3_have.sensors.depth import decode_depth, encode_depth
-from sb3_have.sensors.event_camera import EVENT_DTYPE, EventCamera
-from sb3_have.sensors.representations import count_frames, decode_events, encode_events, stack_by_time, voxel_grid
+from sb3_have.sensors.event_camera import EVENT_DTYPE, PRESETS, EventCamera
+from sb3_have.sensors.representations import (
+    Representation,
+    channels,
+    count_frames,
+    decode_events,
+    encode_events,
+    polarity_counts,
+    represent,
+    stack_by_time,
+    time_surface,
+    voxel_grid,
+)
 
 __all__ = [
     "EVENT_DTYPE",
+    "PRESETS",
     "EventCamera",
+    "Representation",
+    "channels",
     "count_frames",
     "decode_depth",
     "decode_events",
     "encode_depth",
     "encode_events",
+    "polarity_counts",
+    "represent",
     "stack_by_time",
+    "time_surface",
     "voxel_grid",
 ]
