@@ -2,6 +2,7 @@
 
 from sb3_have.sensors.depth import decode_depth, encode_depth
 from sb3_have.sensors.event_camera import EVENT_DTYPE, PRESETS, EventCamera
+from sb3_have.sensors.failures import FAILURES, SENSORS, failures_for
 from sb3_have.sensors.representations import (
     Representation,
     channels,
@@ -14,18 +15,23 @@ from sb3_have.sensors.representations import (
     time_surface,
     voxel_grid,
 )
+from sb3_have.sensors.sensor_failure import SensorFailure
 
 __all__ = [
     "EVENT_DTYPE",
+    "FAILURES",
     "PRESETS",
+    "SENSORS",
     "EventCamera",
     "Representation",
+    "SensorFailure",
     "channels",
     "count_frames",
     "decode_depth",
     "decode_events",
     "encode_depth",
     "encode_events",
+    "failures_for",
     "polarity_counts",
     "represent",
     "stack_by_time",
