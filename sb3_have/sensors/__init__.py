@@ -2,6 +2,8 @@
 
 from sb3_have.sensors.depth import decode_depth, encode_depth
 from sb3_have.sensors.event_camera import EVENT_DTYPE, PRESETS, EventCamera
+from sb3_have.sensors.event_files import EventFile, read_events
+from sb3_have.sensors.event_writer import EventWriter, write_events
 from sb3_have.sensors.failures import FAILURES, SENSORS, failures_for
 from sb3_have.sensors.representations import (
     Representation,
@@ -23,6 +25,8 @@ __all__ = [
     "PRESETS",
     "SENSORS",
     "EventCamera",
+    "EventFile",
+    "EventWriter",
     "Representation",
     "SensorFailure",
     "channels",
@@ -33,8 +37,10 @@ __all__ = [
     "encode_events",
     "failures_for",
     "polarity_counts",
+    "read_events",
     "represent",
     "stack_by_time",
     "time_surface",
     "voxel_grid",
+    "write_events",
 ]

@@ -1,0 +1,505 @@
+"""Recorded event streams: files as DSEC, M3ED and others have them, written and read, whole, in windows and damaged."""
+
+import signal
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sb3_have.sensors import (
+    EVENT_DTYPE,
+    EventCamera,
+    EventFile,
+    EventWriter,
+    count_frames,
+    event_files,
+    event_writer,
+    read_events,
+    stack_by_time,
+    voxel_grid,
+    write_events,
+)
+from sb3_have.sensors.event_writer import Convention
+
+Array = NDArray[Any]
+
+h5py = pytest.importorskip("h5py", reason="recorded events need the extra 'events'")
+hdf5plugin = pytest.importorskip("hdf5plugin", reason="recorded events need the extra 'events'")
+
+#: The example with which DSEC documents its index of milliseconds.
+DSEC_TIMES = [0, 500, 2100, 5000, 5000, 7100, 7200, 7200, 8100, 9000]
+DSEC_INDEX = [0, 2, 2, 3, 3, 3, 5, 5, 8, 9]
+HEIGHT, WIDTH = 6, 5
+
+
+def recording(count: int = 400, last: int = 60_000, seed: int = 0) -> Array:
+    """Random events on whole microseconds, several at one time, none in some milliseconds."""
+    rng = np.random.default_rng(seed)
+    ticks = np.sort(rng.integers(0, last // 10, count) * 10)
+    ticks = ticks[(ticks // 1000) % 7 != 3]
+    events = np.zeros(len(ticks), EVENT_DTYPE)
+    events["t"] = ticks / 1e6
+    events["x"], events["y"] = rng.integers(0, WIDTH, len(ticks)), rng.integers(0, HEIGHT, len(ticks))
+    events["p"] = rng.choice((-1, 1), len(ticks))
+    return events
+
+
+def ticks_of(events: Array) -> Array:
+    return np.asarray(np.rint(events["t"] * 1e6).astype(np.int64))
+
+
+def put(path: Path, events: Array, group: str = "events", **options: Any) -> Path:
+    """A stream by h5py alone, p as 0 and 1."""
+    with h5py.File(path, "a") as file:
+        for name, dtype in (("x", "u2"), ("y", "u2"), ("t", options.pop("time", "u4")), ("p", "u1")):
+            values = {"t": ticks_of(events), "p": events["p"] > 0}.get(name, events[name])
+            file.create_dataset(f"{group}/{name}", data=values.astype(dtype), chunks=(min(64, len(events)),), **options)
+    return path
+
+
+def put_index(path: Path, name: str, index: Any) -> None:
+    with h5py.File(path, "a") as file:
+        file.create_dataset(name, data=np.asarray(index, dtype="u8"))
+
+
+def index_of(ticks: Array) -> Array:
+    return np.array([np.flatnonzero(ticks >= 1000 * ms)[0] for ms in range(ticks[-1] // 1000 + 1)])
+
+
+def assert_same(found: Array, wanted: Array) -> None:
+    assert found.dtype == EVENT_DTYPE
+    for name in ("x", "y", "t", "p"):
+        np.testing.assert_array_equal(found[name], wanted[name], err_msg=name)
+
+
+def test_a_file_as_dsec_has_it(tmp_path: Path) -> None:
+    events = recording(len(DSEC_TIMES) * 4)[: len(DSEC_TIMES)]
+    events["t"] = np.array(DSEC_TIMES) / 1e6
+    path = put(tmp_path / "events.h5", events, **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=2))
+    put_index(path, "ms_to_idx", DSEC_INDEX)
+    with h5py.File(path, "a") as file:
+        file["t_offset"] = np.int64(49_599_300_523)
+    with EventFile(path) as recorded:
+        assert (recorded.group, len(recorded), recorded.height, recorded.width) == ("events", 10, None, None)
+        assert recorded.t_offset == 49_599.300523 and recorded.duration == 0.009
+        assert_same(recorded.read(), events)
+        assert_same(recorded.read(0.0021, 0.0072), events[2:6])
+    with EventFile(path, "/events", height=480, width=640) as recorded:
+        assert (recorded.height, recorded.width) == (480, 640)
+    assert_same(read_events(path, end=0.005), events[:3])
+    assert_same(read_events(path, start=0.005), events[3:])
+
+
+def test_a_file_as_m3ed_has_it(tmp_path: Path) -> None:
+    left, right = recording(), recording(seed=1)
+    path = tmp_path / "m3ed.h5"
+    for side, events in (("left", left), ("right", right)):
+        group = f"prophesee/{side}"
+        put(path, events, group, time="i8", compression="lzf")
+        ticks = ticks_of(events)
+        put_index(path, f"{group}/ms_map_idx", index_of(ticks)[: ticks[-1] // 1000])  # the last one is not in there
+        with h5py.File(path, "a") as file:
+            file[f"{group}/calib/resolution"] = np.array([WIDTH, HEIGHT])
+            file[f"{group}/calib/intrinsics"] = np.ones(4)
+    with h5py.File(path, "a") as file:
+        file["ovc/rgb/data"] = np.zeros((2, 4, 4, 3), np.uint8)
+    with pytest.raises(ValueError, match=r"\['prophesee/left', 'prophesee/right'\]; name one of them as group"):
+        EventFile(path)
+    with pytest.raises(ValueError, match=r"none is 'prophesee/up'; name one of them"):
+        EventFile(path, "prophesee/up")
+    for side, events in (("left", left), ("right", right)):
+        with EventFile(path, f"/prophesee/{side}") as recorded:
+            assert (recorded.height, recorded.width, recorded.t_offset) == (HEIGHT, WIDTH, 0.0)
+            assert_same(recorded.read(), events)
+            assert_same(recorded.read(0.02, 0.04), events[(events["t"] >= 0.02) & (events["t"] < 0.04)])
+    with pytest.raises(ValueError, match=r"width is 5 in .*, got width=7"):
+        EventFile(path, "prophesee/left", width=7)
+
+
+@pytest.mark.parametrize("layout", ["flat", "mvsec"])
+def test_files_that_count_in_seconds(tmp_path: Path, layout: str) -> None:
+    """Their first time stamp is the offset: the times count from there."""
+    events = recording()
+    first = 1_506_117_866.25
+    times, path = first + (events["t"] - events["t"][0]), tmp_path / "events.h5"
+    with h5py.File(path, "w") as file:
+        if layout == "flat":
+            for name, values in (("xs", events["x"]), ("ys", events["y"]), ("ts", times), ("ps", events["p"] > 0)):
+                file[f"events/{name}"] = values
+        else:
+            file["davis/left/events"] = np.stack([events["x"], events["y"], times, events["p"]], axis=1)
+    with EventFile(path) as recorded:
+        assert recorded.t_offset == first
+        found = recorded.read()
+        middle = recorded.read(0.02, 0.04)
+    np.testing.assert_array_equal(found["t"], times - first)
+    for name in ("x", "y", "p"):
+        np.testing.assert_array_equal(found[name], events[name])
+    assert_same(middle, found[(found["t"] >= 0.02) & (found["t"] < 0.04)])
+
+
+@pytest.mark.parametrize("index", ["right", "none", "short", "shifted", "garbage"])
+def test_every_window_is_that_of_a_mask(tmp_path: Path, index: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The index of milliseconds may save reading, it cannot change what is read."""
+    monkeypatch.setattr(event_files, "BLOCK", 8)
+    events = recording()
+    path = put(tmp_path / "events.h5", events)
+    right = index_of(ticks_of(events))
+    rows = {
+        "right": right,
+        "short": right[:9],
+        "shifted": np.roll(right, 5),
+        "garbage": np.random.default_rng(2).integers(0, 2 * len(events), len(right)),
+    }
+    if index in rows:
+        put_index(path, "ms_to_idx", rows[index])
+    edges = sorted({0.0, 0.003, 0.0035, 0.01, 0.059999, 0.07, *events["t"][::9], *np.arange(0, 0.061, 0.004)})
+    with EventFile(path) as recorded:
+        for start in edges:
+            for end in edges:
+                if start <= end:
+                    wanted = events[(events["t"] >= start) & (events["t"] < end)]
+                    assert_same(recorded.read(start, end), wanted)
+    assert_same(read_events(path, -1.0, np.inf), events)
+
+
+@pytest.mark.parametrize("convention", ["dsec", "m3ed"])
+def test_what_is_written_is_read(tmp_path: Path, convention: Convention) -> None:
+    events, path = recording(), tmp_path / "events.h5"
+    offset = 12.345678 if convention == "dsec" else 0.0
+    write_events(path, events, HEIGHT, WIDTH, convention, t_offset=offset)
+    with EventFile(path) as recorded:
+        assert (recorded.height, recorded.width, recorded.t_offset) == (HEIGHT, WIDTH, offset)
+        assert recorded.duration == events["t"][-1]
+        assert_same(recorded.read(), events)
+    assert_same(read_events(path, 0.013, 0.014), events[(events["t"] >= 0.013) & (events["t"] < 0.014)])
+
+
+def test_what_is_written_is_what_the_data_sets_have(tmp_path: Path) -> None:
+    events = recording(len(DSEC_TIMES) * 4)[: len(DSEC_TIMES)]
+    events["t"] = np.array(DSEC_TIMES) / 1e6
+    write_events(tmp_path / "dsec.h5", events, HEIGHT, WIDTH, t_offset=2.5)
+    write_events(tmp_path / "m3ed.h5", events, HEIGHT, WIDTH, "m3ed")
+    with h5py.File(tmp_path / "dsec.h5") as file:
+        assert file["t_offset"][()] == 2_500_000
+        assert file["ms_to_idx"][:].tolist() == DSEC_INDEX
+        assert [file["events"][name].dtype.str for name in "xytp"] == ["<u2", "<u2", "<u4", "|u1"]
+        assert file["events/t"][:].tolist() == DSEC_TIMES
+        np.testing.assert_array_equal(file["events/p"], events["p"] > 0)
+        # 32001 is Blosc in the registry of HDF5 filters
+        assert file["events/t"].id.get_create_plist().get_filter(0)[0] == 32001
+    with h5py.File(tmp_path / "m3ed.h5") as file:
+        group = file["prophesee/left"]
+        assert group["ms_map_idx"][:].tolist() == DSEC_INDEX
+        assert [group[name].dtype.str for name in "xytp"] == ["<u2", "<u2", "<i8", "|i1"]
+        assert group["calib/resolution"][:].tolist() == [WIDTH, HEIGHT]
+        assert group["t"].compression == "lzf"
+
+
+def test_times_are_rounded_to_the_nearest_microsecond_in_order(tmp_path: Path) -> None:
+    events = np.zeros(5, EVENT_DTYPE)
+    events["t"], events["p"] = [0.0, 0.4e-6, 0.6e-6, 1.4e-6, 4000.1234564], 1
+    write_events(tmp_path / "events.h5", events, HEIGHT, WIDTH)
+    assert read_events(tmp_path / "events.h5")["t"].tolist() == [0.0, 0.0, 1e-6, 1e-6, 4000.123456]
+
+
+def film(frames: int = 12) -> Array:
+    rng = np.random.default_rng(3)
+    return np.asarray(np.cumsum(rng.normal(0, 0.8, (frames, HEIGHT, WIDTH)), axis=0))
+
+
+@pytest.mark.parametrize("convention", ["dsec", "m3ed"])
+def test_a_recorded_camera_gives_the_frames_of_the_live_one(
+    tmp_path: Path, convention: Convention, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(event_writer, "CHUNK", 64)
+    camera, path = EventCamera(HEIGHT, WIDTH, mapping="identity", seed=0), tmp_path / "events.h5"
+    live = []
+    with EventWriter(path, HEIGHT, WIDTH, convention) as writer:
+        for k, frame in enumerate(film()):
+            events = camera.step(frame, 0.05 * k)
+            events["t"] = np.rint(events["t"] * 1e6) / 1e6  # a camera whose clock ticks in microseconds
+            writer.append(events)
+            live.append(events)
+    with EventFile(path) as recorded:
+        assert len(recorded) == sum(map(len, live)) > 10 * 64
+        assert_same(recorded.read(), np.concatenate(live))
+        for k in range(1, len(live)):
+            window = 0.05 * (k - 1), 0.05 * k
+            # The window of a live step is closed: its last event may fall on the frame.
+            found = recorded.read(window[0], window[1] + 0.5e-6)
+            for image in (stack_by_time, voxel_grid, count_frames):
+                size = (5, *window, HEIGHT, WIDTH)
+                wanted = image(live[k], *size)
+                assert wanted.any()
+                np.testing.assert_array_equal(image(found, *size), wanted)
+
+
+def test_windows_hold_every_event_once(tmp_path: Path) -> None:
+    events, path = recording(), tmp_path / "events.h5"
+    write_events(path, events, HEIGHT, WIDTH)
+    with EventFile(path) as recorded:
+        for duration in (0.003, 0.0071, 0.1):
+            windows = list(recorded.windows(duration))
+            assert_same(np.concatenate([inside for *_, inside in windows]), events)
+            assert all(one[1] == two[0] for one, two in pairwise(windows))
+            assert all(((inside["t"] >= t0) & (inside["t"] < t1)).all() for t0, t1, inside in windows)
+            assert windows[0][0] == 0.0 and len(windows[-1][2])
+        assert any(not len(inside) for *_, inside in recorded.windows(0.0005))
+        assert_same(np.concatenate([w[2] for w in recorded.windows(0.01, start=0.02)]), events[events["t"] >= 0.02])
+        assert list(recorded.windows(0.01, start=1.0)) == []
+        for bad in (0.0, -1.0, np.nan, np.inf):
+            with pytest.raises(ValueError, match="finite duration > 0"):
+                recorded.windows(bad)
+
+
+def test_windows_begin_with_the_first_event(tmp_path: Path) -> None:
+    """A clock that started long before the recording does not cost hours of empty windows."""
+    events = recording()
+    events["t"] += 3600
+    write_events(tmp_path / "events.h5", events, HEIGHT, WIDTH)
+    with EventFile(tmp_path / "events.h5") as recorded:
+        windows = list(recorded.windows(0.01, start=0.005))
+        assert len(windows[0][2]) and len(windows) == 7
+        assert_same(np.concatenate([inside for *_, inside in windows]), read_events(tmp_path / "events.h5"))
+
+
+@pytest.mark.parametrize("index", [True, False])
+def test_a_window_reads_its_rows_only(tmp_path: Path, index: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    events, path = recording(300_000, last=30_000_000), tmp_path / "events.h5"
+    write_events(path, events, HEIGHT, WIDTH)
+    if not index:
+        with h5py.File(path, "a") as file:
+            del file["ms_to_idx"]
+    rows: list[int] = []
+    read = h5py.Dataset.__getitem__
+
+    def count(dataset: Any, *args: Any, **options: Any) -> Any:
+        values = read(dataset, *args, **options)
+        rows.append(np.size(values))
+        return values
+
+    monkeypatch.setattr(h5py.Dataset, "__getitem__", count)
+    with EventFile(path) as recorded:
+        window = recorded.read(12.0, 12.01)
+    assert len(window) > 50
+    # Four columns, and what finding two rows takes: two milliseconds, or two blocks at the end of a bisection.
+    lookup = 200 if index else 2 * event_files.BLOCK + 100
+    assert 4 * len(window) <= sum(rows) <= 4 * len(window) + lookup
+
+
+def test_chunks_add_up_to_the_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(event_writer, "CHUNK", 32)
+    events = recording()
+    write_events(tmp_path / "whole.h5", events, HEIGHT, WIDTH)
+    with EventWriter(tmp_path / "parts.h5", HEIGHT, WIDTH) as writer:
+        for k, part in enumerate(np.split(events, [0, 1, 5, 40, 41, 200, 300])):
+            writer.append(part)
+            if k == 3:
+                writer.flush()
+                writer.flush()
+    assert_same(read_events(tmp_path / "parts.h5"), events)
+    with h5py.File(tmp_path / "whole.h5") as whole, h5py.File(tmp_path / "parts.h5") as parts:
+        np.testing.assert_array_equal(parts["ms_to_idx"], whole["ms_to_idx"])
+        np.testing.assert_array_equal(parts["ms_to_idx"], index_of(ticks_of(events)))
+
+
+def test_an_exception_keeps_what_was_appended(tmp_path: Path) -> None:
+    events, path = recording(), tmp_path / "events.h5"
+    with pytest.raises(ZeroDivisionError), EventWriter(path, HEIGHT, WIDTH) as writer:
+        writer.append(events)
+        raise ZeroDivisionError
+    assert_same(read_events(path), events)
+    writer.close()
+    with pytest.raises(ValueError, match="is closed"):
+        writer.append(events)
+
+
+KILLED = """
+import os, signal, sys
+import numpy as np
+from sb3_have.sensors import EVENT_DTYPE, EventWriter, event_writer
+event_writer.CHUNK = 100
+writer = EventWriter(sys.argv[1], 4, 4)
+for k in range(25):
+    events = np.zeros(30, EVENT_DTYPE)
+    events["t"], events["p"], events["x"] = 0.001 * k, 1, k % 4
+    writer.append(events)
+    if k == 12 and sys.argv[2] == "flush":
+        writer.flush()
+        break
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+@pytest.mark.parametrize(("how", "kept"), [("append", 700), ("flush", 390)])
+def test_a_killed_process_leaves_whole_chunks(tmp_path: Path, how: str, kept: int) -> None:
+    path = tmp_path / "events.h5"
+    command = [sys.executable, "-c", KILLED, str(path), how]
+    assert subprocess.run(command, cwd=Path(__file__).parent.parent, timeout=120).returncode == -signal.SIGKILL
+    with EventFile(path) as recorded:
+        assert len(recorded) == kept
+        found = recorded.read()
+        np.testing.assert_array_equal(found["t"], np.arange(kept) // 30 / 1e3)
+        np.testing.assert_array_equal(found["x"], np.arange(kept) // 30 % 4)
+        assert_same(recorded.read(0.004, 0.006), found[120:180])
+
+
+def test_an_empty_recording(tmp_path: Path) -> None:
+    path = tmp_path / "events.h5"
+    write_events(path, np.zeros(0, EVENT_DTYPE), HEIGHT, WIDTH)
+    with EventFile(path) as recorded:
+        assert len(recorded) == 0 and recorded.duration == 0.0 and (recorded.height, recorded.width) == (HEIGHT, WIDTH)
+        assert_same(recorded.read(), np.zeros(0, EVENT_DTYPE))
+        assert_same(recorded.read(0.0, 1.0), np.zeros(0, EVENT_DTYPE))
+        assert list(recorded.windows(0.1)) == []
+
+
+def test_a_recording_is_not_replaced_unless_asked(tmp_path: Path) -> None:
+    path = tmp_path / "events.h5"
+    write_events(path, recording(), HEIGHT, WIDTH)
+    with pytest.raises(FileExistsError, match="overwrite=True"):
+        write_events(path, recording(seed=1), HEIGHT, WIDTH)
+    assert_same(read_events(path), recording())
+    write_events(path, recording(seed=1), HEIGHT, WIDTH, overwrite=True)
+    assert_same(read_events(path), recording(seed=1))
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("t", -0.1, "finite and >= 0"),
+        ("t", np.nan, "finite and >= 0"),
+        ("t", 0.0001, r"sorted by t and come after those before, up to 0\.5"),
+        ("t", 5000.0, r"more than the 4294\.967295 s"),
+        ("x", WIDTH, "x of the events spans 5..5, outside of a sensor of 6 rows and 5 columns"),
+        ("y", HEIGHT, "y of the events spans 6..6"),
+        ("p", 0, r"p must be -1 or 1, got \[0\]"),
+    ],
+)
+def test_events_that_do_not_fit_are_refused(tmp_path: Path, field: str, value: float, message: str) -> None:
+    good, bad = np.zeros(1, EVENT_DTYPE), np.zeros(1, EVENT_DTYPE)
+    good["t"] = bad["t"] = 0.5
+    good["p"] = bad["p"] = 1
+    bad[field] = value
+    path = tmp_path / "events.h5"
+    with EventWriter(path, HEIGHT, WIDTH) as writer:
+        writer.append(good)
+        with pytest.raises(ValueError, match=message):
+            writer.append(bad)
+        writer.append(good)
+    assert len(read_events(path)) == 2
+    with pytest.raises(ValueError, match="sorted by t"):
+        write_events(tmp_path / "refused.h5", recording()[::-1], HEIGHT, WIDTH)
+    assert not (tmp_path / "refused.h5").exists()
+
+
+def test_arguments_of_the_writer(tmp_path: Path) -> None:
+    path = tmp_path / "events.h5"
+    with pytest.raises(ValueError, match=r"one of \('dsec', 'm3ed'\), got 'rosbag'"):
+        EventWriter(path, 4, 4, "rosbag")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match=r"1\.\.65535, got 0 and 4"):
+        EventWriter(path, 0, 4)
+    with pytest.raises(ValueError, match=r"0 for 'm3ed', got 2\.0"):
+        EventWriter(path, 4, 4, "m3ed", t_offset=2.0)
+    with EventWriter(path, 4, 4) as writer, pytest.raises(ValueError, match="fields x, y, t and p"):
+        writer.append(np.zeros(3, dtype=[("x", "u2"), ("y", "u2")]))
+
+
+def damaged(path: Path, change: str) -> Path:
+    events = recording()
+    put(path, events)
+    with h5py.File(path, "a") as file:
+        group = file["events"]
+        column = change.split()[0]
+        values: Array = group[column][:]
+        if change == "p missing":
+            del group["p"]
+        elif change == "p short":
+            del group["p"]
+            group["p"] = values[:-3]
+        elif change == "t back":
+            group["t"][100] = values[99] - 1
+        elif change == "p two":
+            group["p"][7] = 2
+        elif change == "t negative":
+            del group["t"]
+            group["t"] = values.astype("i8") - 10**6
+        elif change == "x wide":
+            group.attrs["height"], group.attrs["width"] = HEIGHT, WIDTH
+            group["x"][3] = WIDTH
+        elif change == "y fractions":
+            del group["y"]
+            group["y"] = values + 0.5
+        elif change == "y negative":
+            del group["y"]
+            group["y"] = values.astype("i2") - 2
+        elif change == "p three":
+            del group["p"]
+            group["p"] = np.resize(np.array([-1, 0, 1], np.int8), len(values))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("p missing", r"holds no event stream, .* it holds \['events/t', 'events/x', 'events/y'\]"),
+        ("p short", "differ in length, .*truncated"),
+        ("t back", "steps back after row 99, from .*; sort the events"),
+        ("t negative", "shift it to start at 0 or later"),
+        ("p two", r"must be 0 and 1 or -1 and 1, got \[0, 1, 2\]"),
+        ("p three", r"must be 0 and 1 or -1 and 1, got \[-1, 0, 1\]"),
+        ("x wide", r"x of 'events' .* spans 0..5 in rows 0..333, outside of a width of 5"),
+        ("y fractions", "fractions of a pixel"),
+        ("y negative", r"y of 'events' .* spans -2..3"),
+    ],
+)
+def test_damaged_streams(tmp_path: Path, change: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        read_events(damaged(tmp_path / "events.h5", change))
+
+
+def test_files_that_cannot_be_opened(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"no event file .*none\.h5"):
+        EventFile(tmp_path / "none.h5")
+    (tmp_path / "text.h5").write_text("x y t p\n1 2 0.5 1\n")
+    with pytest.raises(ValueError, match=r"text\.h5 is not an HDF5 file"):
+        EventFile(tmp_path / "text.h5")
+    with h5py.File(tmp_path / "empty.h5", "w"):
+        pass
+    with pytest.raises(ValueError, match="it holds no datasets"):
+        EventFile(tmp_path / "empty.h5")
+    path = put(tmp_path / "cut.h5", recording())
+    path.write_bytes(path.read_bytes()[:-200])
+    with pytest.raises(OSError, match=r"cannot open .*cut\.h5.*truncated, copy it again"):
+        EventFile(path)
+    path = put(tmp_path / "rotten.h5", recording(), compression="gzip", fletcher32=True)
+    with h5py.File(path) as file:
+        offset = file["events/x"].id.get_chunk_info(0).byte_offset
+    data = bytearray(path.read_bytes())
+    data[offset : offset + 8] = bytes(8)
+    path.write_bytes(data)
+    with pytest.raises(OSError, match=r"cannot read /events/x in .*rotten\.h5.*damaged"):
+        read_events(path)
+    with EventFile(put(tmp_path / "good.h5", recording())) as recorded, pytest.raises(ValueError, match="start <= end"):
+        recorded.read(2.0, 1.0)
+
+
+def test_h5py_is_imported_only_when_called(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    code = "import sys, sb3_have.sensors; print(sorted({'h5py', 'hdf5plugin'} & set(sys.modules)))"
+    command = [sys.executable, "-c", code]
+    root = Path(__file__).parent.parent
+    found = subprocess.run(command, cwd=root, timeout=120, capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"
+    for name in ("h5py", "hdf5plugin"):
+        with monkeypatch.context() as patch:
+            patch.setitem(sys.modules, name, None)
+            with pytest.raises(ImportError, match=r'pip install "sb3_have\[events\]"'):
+                read_events(tmp_path / "events.h5")
+            with pytest.raises(ImportError, match=r'pip install "sb3_have\[events\]"'):
+                write_events(tmp_path / "events.h5", recording(), HEIGHT, WIDTH)
