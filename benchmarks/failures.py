@@ -1,0 +1,105 @@
+"""How far a trained model still drives when one of its sensors fails for whole episodes.
+
+    python -m sb3_have.demo                                              # trains a model, or take one of your own
+    python -m benchmarks.failures runs/demo/havesac_demo.zip --config havesac
+
+Every modality fails in every way that it can, at one severity; the episodes are the same for all, drawn from all
+weathers. Each row is appended to the CSV file as it is made; the same command goes on where it was stopped. Columns:
+``modality, kind, severity`` ("none" for the healthy car), ``distance_mean``, ``distance_std`` [m] and ``return_mean``
+over the ``episodes``, ``kept``: the distance over the healthy one, ``crash_share`` and ``offroad_share``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+import torch as th
+from gymnasium import spaces
+
+from benchmarks.measure import RESULTS, machine
+from sb3_have import HAVESAC
+from sb3_have.common.evaluation import evaluate_episodes
+from sb3_have.configuration import evaluation_env_kwargs, load_config
+from sb3_have.envs.weather import WEATHERS
+from sb3_have.sensors import SensorFailure, failures_for
+
+NONE = ("none", "none", 0)
+Case = tuple[str, str, int]
+
+
+def cases(space: spaces.Space[Any], severity: int) -> Iterator[Case]:
+    """The healthy car, then every modality in its own order with every kind of failure it knows."""
+    assert isinstance(space, spaces.Dict)
+    yield NONE
+    for modality in space.spaces:
+        for kind in failures_for(modality):
+            yield modality, kind, severity
+
+
+def drive(model: Any, env_id: str, case: Case, n_episodes: int, seed: int, **kwargs: Any) -> dict[str, Any]:
+    """One row of the table.
+
+    :param model: trained on ``env_id``
+    :param case: modality, kind and severity
+    :param n_episodes: in each weather
+    :param seed: of the episodes
+    :param kwargs: further ones of :func:`~sb3_have.common.evaluation.evaluate_episodes`
+    """
+    modality, kind, severity = case
+    failure = None if case == NONE else partial(SensorFailure, modality=modality, kind=kind, severity=severity)
+    episodes = evaluate_episodes(model, env_id, WEATHERS, n_episodes, seed, env_wrapper=failure, **kwargs)
+    return {
+        "modality": modality,
+        "kind": kind,
+        "severity": severity,
+        "distance_mean": episodes["distance"].mean(),
+        "distance_std": episodes["distance"].std(ddof=0),
+        "return_mean": episodes["return"].mean(),
+        "crash_share": episodes["crashed"].mean(),
+        "offroad_share": episodes["offroad"].mean(),
+    }
+
+
+def main(arguments: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("model", type=Path, help="zip file of a HAVESAC")
+    parser.add_argument("--config", default="havesac", help="the configuration it was trained with")
+    parser.add_argument("--env", default="HighwayVision-v0")
+    parser.add_argument("--severity", type=int, default=3, choices=(1, 2, 3))
+    parser.add_argument("--episodes", type=int, default=2, help="in each weather")
+    parser.add_argument("--seed", type=int, default=0, help="of the episodes")
+    parser.add_argument("--envs", type=int, default=2, help="processes")
+    parser.add_argument("--out", type=Path, default=RESULTS / "failures.csv")
+    args = parser.parse_args(arguments)
+
+    th.set_num_threads(1)
+    model = HAVESAC.load(args.model, device="cpu")
+    env_kwargs = evaluation_env_kwargs(load_config(args.config, args.env))
+    of_run = {"model": args.model.name, "training_steps": model.num_timesteps, "seed": args.seed}
+    of_run |= {"episodes": args.episodes * len(WEATHERS)}
+    done = pd.DataFrame(columns=["modality", "kind", "severity", *of_run])
+    if args.out.exists():
+        done = pd.read_csv(args.out, keep_default_na=False)
+        if (done[list(of_run)] != list(of_run.values())).any(axis=None):
+            raise SystemExit(f"{args.out} is of another run than {of_run}: give another --out, or remove it")
+    finished = set(zip(done["modality"], done["kind"], done["severity"], strict=True))
+    for case in cases(model.observation_space, args.severity):
+        if case in finished:
+            continue
+        row = drive(model, args.env, case, args.episodes, args.seed, env_kwargs=env_kwargs, n_envs=args.envs)
+        healthy = row if case == NONE else done[done["kind"] == "none"].iloc[0]
+        row["kept"] = row["distance_mean"] / healthy["distance_mean"]
+        row |= of_run | machine()
+        frame = pd.DataFrame([row]).round(3)
+        frame.to_csv(args.out, mode="a", header=not args.out.exists(), index=False)
+        done = pd.concat([done, frame]) if len(done) else frame
+        print(f"{case[0]:6} {case[1]:16} {row['distance_mean']:6.0f} m, {row['kept']:.2f} of the healthy", flush=True)
+
+
+if __name__ == "__main__":
+    main()
