@@ -186,7 +186,7 @@ class EventCamera:
             camera is then as before the call.
         """
         pixel, times, polarity = self.detect(frame, t)
-        order = np.argsort(times, kind="stable")
+        order = _by_time(times)
         events = np.empty(len(order), dtype=EVENT_DTYPE)
         events["y"], events["x"] = np.divmod(pixel[order], self.width)
         events["t"] = times[order]
@@ -309,6 +309,14 @@ class EventCamera:
             keep[alive] = True
             self._last_event[pixel[alive]] = times[alive]
         return pixel[keep], times[keep], polarity[keep]
+
+
+def _by_time(times: FloatArray) -> IntArray:
+    """Stable order of the times. The sort that is not stable is several times faster, and the same without ties."""
+    order = np.argsort(times)
+    if (np.diff(times[order]) == 0).any():
+        order = np.argsort(times, kind="stable")
+    return order
 
 
 def _by_pixel(pixel: IntArray, times: FloatArray) -> IntArray:
