@@ -1,10 +1,13 @@
 """Simulated sensors and the 8-bit forms in which their images travel."""
 
-from sb3_have.sensors.depth import decode_depth, encode_depth
+from sb3_have.sensors.depth import decode_depth, depth_from_zbuffer, disparity_noise, encode_depth
+from sb3_have.sensors.depth_observation import DepthObservation
 from sb3_have.sensors.event_camera import EVENT_DTYPE, PRESETS, EventCamera
 from sb3_have.sensors.event_files import EventFile, read_events
+from sb3_have.sensors.event_observation import EventObservation
 from sb3_have.sensors.event_writer import EventWriter, write_events
 from sb3_have.sensors.failures import FAILURES, SENSORS, failures_for
+from sb3_have.sensors.rendering import RenderObservation
 from sb3_have.sensors.representations import (
     Representation,
     channels,
@@ -18,21 +21,30 @@ from sb3_have.sensors.representations import (
     voxel_grid,
 )
 from sb3_have.sensors.sensor_failure import SensorFailure
+from sb3_have.sensors.wrappers import ChannelLastImages, DictObservation, SelectModalities
 
 __all__ = [
     "EVENT_DTYPE",
     "FAILURES",
     "PRESETS",
     "SENSORS",
+    "ChannelLastImages",
+    "DepthObservation",
+    "DictObservation",
     "EventCamera",
     "EventFile",
+    "EventObservation",
     "EventWriter",
+    "RenderObservation",
     "Representation",
+    "SelectModalities",
     "SensorFailure",
     "channels",
     "count_frames",
     "decode_depth",
     "decode_events",
+    "depth_from_zbuffer",
+    "disparity_noise",
     "encode_depth",
     "encode_events",
     "failures_for",
