@@ -4,7 +4,8 @@ Every function has the form ``f(image, rng, **parameters) -> new image``: it lea
 dtype. The kinds follow the common-corruption benchmarks of robust perception (Hendrycks and Dietterich, "Benchmarking
 Neural Network Robustness to Common Corruptions and Perturbations", ICLR 2019) and what event and depth cameras add;
 the numbers are our own. Images are uint8 (H, W, C) as everywhere in this package: events 128 + signed count with 0 for
-"no data", depth 1..255 with 0 for "nothing there".
+"no data", depth 1..255 with 0 for "nothing there". Spurious events have either sign, as in the "sbt" and "voxel"
+representations.
 """
 
 from __future__ import annotations
@@ -85,7 +86,9 @@ def gaussian_noise(image: Image, rng: Rng, sigma: float) -> Image:
 
 def spurious_events(image: Image, rng: Rng, rate: float) -> Image:
     """Events out of thin air, of either sign. ``rate`` expected per pixel and bin; where there is no data stays 0."""
-    return _add_events(image, rng.poisson(rate / 2, image.shape) - rng.poisson(rate / 2, image.shape))
+    entries = rng.integers(image.size, size=rng.poisson(rate * image.size))
+    signs = rng.choice((-1.0, 1.0), len(entries))
+    return _add_events(image, np.bincount(entries, signs, image.size).reshape(image.shape))
 
 
 def depth_noise(image: Image, rng: Rng, sigma: float) -> Image:
