@@ -1,4 +1,4 @@
-"""Environments. Importing this package registers ``HighwayVision-v0`` with gymnasium."""
+"""Environments. Importing this package registers ``HighwayVision-v0`` and ``CarlaVision-v0`` with gymnasium."""
 
 from gymnasium.envs.registration import WrapperSpec, register, registry
 
@@ -12,5 +12,14 @@ if "HighwayVision-v0" not in registry:
         entry_point="sb3_have.envs.highway_vision:HighwayVisionEnv",
         max_episode_steps=500,
         kwargs={"max_episode_steps": None},  # gymnasium counts, see ReportTimeout
+        additional_wrappers=(WrapperSpec("ReportTimeout", "sb3_have.envs.highway_vision:ReportTimeout", {}),),
+    )
+
+if "CarlaVision-v0" not in registry:
+    register(
+        id="CarlaVision-v0",
+        entry_point="sb3_have.envs.carla_vision:CarlaVisionEnv",  # by name: the package carla is an extra
+        max_episode_steps=500,
+        kwargs={"max_episode_steps": None},
         additional_wrappers=(WrapperSpec("ReportTimeout", "sb3_have.envs.highway_vision:ReportTimeout", {}),),
     )

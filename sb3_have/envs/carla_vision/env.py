@@ -1,0 +1,366 @@
+"""CarlaVision-v0: the highway of Town04 in CARLA, seen through an RGB camera, an event camera and a depth camera."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+
+from sb3_have.envs.carla_vision.rules import Reward, RewardForm, Trip
+from sb3_have.envs.carla_vision.sensors import dvs_attributes, event_options
+from sb3_have.envs.highway_vision import _weather_choices
+from sb3_have.envs.vision import DEPTH_DEFAULTS, MODALITIES, Observation, compose
+from sb3_have.sensors.depth import encode_depth
+from sb3_have.sensors.representations import channels
+
+if TYPE_CHECKING:
+    from sb3_have.envs.carla_vision.episode import Episode
+    from sb3_have.envs.carla_vision.session import Session
+
+#: Options that make ``CarlaVision-v0`` the environment of the paper's experiments: 20 Hz control, the full lock,
+#: traffic at the traffic manager's own speeds.
+PAPER: Final[Mapping[str, Any]] = MappingProxyType(
+    {
+        "modalities": ("rgb", "event"),
+        "image_size": 128,
+        "policy_frequency": 20,
+        "max_episode_steps": 1000,
+        "steering_range": None,
+        "traffic_speed": None,
+        "reward": "paper",
+    }
+)
+
+
+class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
+    """A highway in CARLA with traffic, continuous throttle and steering, and images for observations.
+
+    Needs the package ``carla`` (extra ``carla``) and a running server, which it connects to at the first ``reset``. The
+    server is put into synchronous mode and driven by this environment alone. ``close``, any exception out of ``reset``
+    or ``step``, and the end of the program remove what was put there and restore the server's settings; the next
+    ``reset`` connects anew. The map is loaded only if the server has another one.
+
+    Observation, action and ``info`` are those of HighwayVision-v0
+    (:class:`~sb3_have.envs.highway_vision.HighwayVisionEnv`), with ``end_reason`` "standstill" besides. The ego starts
+    on road 45 of Town04, in one of the lanes -1 to -4 at 100 to 110 m, the traffic in those lanes at 114 to 300 m, all
+    at rest; CARLA's traffic manager drives it. The camera sits 1 m ahead of and 1.5 m above the car's centre and sees
+    60 degrees. An episode is terminated by ``collision_ticks`` simulation ticks with a collision in all ("crash"), by
+    leaving the driving lanes ("offroad") and after ``standstill_time`` without moving; ``max_episode_steps`` truncates
+    it. ``distance`` is the sum of v_s dt. The reward is :class:`~sb3_have.envs.carla_vision.rules.Reward`.
+
+    The same seed gives the same places, cars, colours, speeds and seed of the traffic manager. CARLA's physics and the
+    noise of its event camera are its own: whole episodes do not repeat to the bit.
+
+    Options that HighwayVision-v0 has too:
+
+    :param weather: as there; presets of ``carla.WeatherParameters``
+    :param modalities: any of "rgb", "event", "depth"
+    :param image_size: height and width of the images [px]
+    :param vehicles_count: other vehicles; without any there is no traffic manager either
+    :param traffic_speed: range of the speeds the others want to drive at [m/s]; None leaves it to the traffic manager
+        (70% of the limit)
+    :param lanes_count: lanes that cars are put in, from the innermost
+    :param max_episode_steps: control steps per episode, or None for no limit
+    :param initial_speed: of the ego vehicle [m/s], in 0 to ``max_speed``
+    :param simulation_frequency: [Hz], at least 10 (CARLA's physics) and a multiple of ``policy_frequency``
+    :param policy_frequency: control steps per second [Hz]
+    :param steering_range: angle of the front wheels at full steering [rad]; None for the vehicle's lock, as in the
+        paper. More than in HighwayVision-v0 by default: the road bends, and CARLA steers less at speed
+    :param max_speed: the throttle closes at this speed [m/s]; the car does not reverse
+    :param steer_cost: reward weight
+    :param brake_cost: reward weight
+    :param crash_penalty: reward weight; None: 0 with the paper's reward, 20 with HighwayVision's
+    :param event: ``bins``, ``representation``, ``threshold`` (one or a pair: positive, negative), ``threshold_sigma``
+        (CARLA draws it anew for every event), ``refractory`` [s], ``mapping`` ("log", "identity") and ``log_eps`` of
+        the event camera, see :data:`~sb3_have.envs.carla_vision.sensors.EVENT_DEFAULTS`
+    :param depth: ``encoding`` and ``max`` as in HighwayVision-v0
+    :param render_mode: None or "rgb_array" (RGB | event | depth side by side)
+    :param scenario: "highway"; for other roads choose ``town`` and ``road_id``
+
+    and those of its own:
+
+    :param reward: "paper" or "highway"
+    :param collision_cost: reward weight, per N s; None: 0.001 with the paper's reward, 0 with HighwayVision's
+    :param collision_ticks: simulation ticks with a collision that end an episode
+    :param standstill_time: seconds below 0.1 m/s in a row that end an episode, also at its start; None: never
+    :param host: of the server
+    :param port: of the server
+    :param tm_port: of the traffic manager; each environment needs a server and such a port of its own
+    :param town: name of the map
+    :param road_id: OpenDRIVE id of the road that cars are put on
+    :param timeout: for an answer of the server, a tick or an image [s]
+    :param ego_vehicle: blueprint of the ego
+    :raises ValueError: for any option outside of what is stated here
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 (declared so by gymnasium)
+
+    def __init__(
+        self,
+        weather: str | Sequence[str] = "random",
+        modalities: Sequence[str] = MODALITIES,
+        image_size: int = 84,
+        vehicles_count: int = 20,
+        traffic_speed: tuple[float, float] | None = (21.0, 24.0),
+        lanes_count: int = 4,
+        max_episode_steps: int | None = 500,
+        initial_speed: float = 0.0,
+        simulation_frequency: int = 20,
+        policy_frequency: int = 5,
+        steering_range: float | None = 0.1,
+        max_speed: float = 30.0,
+        steer_cost: float = 0.1,
+        brake_cost: float = 0.1,
+        crash_penalty: float | None = None,
+        event: Mapping[str, Any] | None = None,
+        depth: Mapping[str, Any] | None = None,
+        render_mode: str | None = None,
+        scenario: str = "highway",
+        reward: RewardForm = "paper",
+        collision_cost: float | None = None,
+        collision_ticks: int = 20,
+        standstill_time: float | None = 5.0,
+        host: str = "localhost",
+        port: int = 2000,
+        tm_port: int = 8000,
+        town: str = "Town04",
+        road_id: int = 45,
+        timeout: float = 10.0,
+        ego_vehicle: str = "vehicle.tesla.model3",
+    ) -> None:
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
+        if scenario != "highway":
+            raise ValueError(f"CARLA has no scenario {scenario!r}; choose another road by `town` and `road_id`")
+        if isinstance(modalities, str) or not modalities or not set(modalities) <= set(MODALITIES):
+            raise ValueError(f"modalities must be a non-empty subset of {MODALITIES}, got {modalities!r}")
+        for name, value, least in [
+            ("image_size", image_size, 16),
+            ("vehicles_count", vehicles_count, 0),
+            ("lanes_count", lanes_count, 1),
+            ("max_episode_steps", 1 if max_episode_steps is None else max_episode_steps, 1),
+            ("policy_frequency", policy_frequency, 1),
+            ("simulation_frequency", simulation_frequency, 10),
+            ("collision_ticks", collision_ticks, 1),
+            ("port", port, 1),
+            ("tm_port", tm_port, 1024),
+        ]:
+            if not isinstance(value, int | np.integer) or value < least:
+                raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
+        if simulation_frequency % policy_frequency:
+            raise ValueError(
+                f"simulation_frequency ({simulation_frequency} Hz) must be a multiple of "
+                f"policy_frequency ({policy_frequency} Hz), or control steps would lose time"
+            )
+        for name, positive in [
+            ("timeout", timeout),
+            ("steering_range", steering_range),
+            ("standstill_time", standstill_time),
+        ]:
+            if positive is not None and not (np.isfinite(positive) and positive > 0):
+                raise ValueError(f"{name} must be positive, got {positive!r}")
+        if traffic_speed is not None and (
+            np.shape(traffic_speed) != (2,) or not 0 < traffic_speed[0] <= traffic_speed[1]
+        ):
+            raise ValueError(f"traffic_speed must be None or a range of positive speeds [m/s], got {traffic_speed!r}")
+        self._reward = Reward(reward, steer_cost, brake_cost, collision_cost, crash_penalty, max_speed)
+        if not 0 <= initial_speed <= max_speed:
+            raise ValueError(f"initial_speed must lie in 0..max_speed ({max_speed} m/s), got {initial_speed!r}")
+        self.weathers = _weather_choices(weather)
+        self.modalities = tuple(name for name in MODALITIES if name in modalities)
+        self.max_episode_steps = max_episode_steps
+        self.collision_ticks, self.standstill_time = int(collision_ticks), standstill_time
+        self._event, self._depth = event_options(event), _depth_options(depth)
+        dvs_attributes(self._event)  # complains about a wrong option now, not at reset
+        size = int(image_size)
+        event_channels = channels(self._event["representation"], self._event["bins"])
+        self._plan: dict[str, Any] = {
+            "modalities": self.modalities,
+            "image_size": size,
+            "event": self._event,
+            "depth": self._depth,
+            "vehicles_count": int(vehicles_count),
+            "traffic_speed": None if traffic_speed is None else tuple(float(speed) for speed in traffic_speed),
+            "lanes_count": int(lanes_count),
+            "road_id": int(road_id),
+            "ego_vehicle": ego_vehicle,
+            "initial_speed": float(initial_speed),
+            "max_speed": float(max_speed),
+            "steering_range": None if steering_range is None else float(steering_range),
+        }
+        self._server: dict[str, Any] = {
+            "host": host,
+            "port": int(port),
+            "tm_port": int(tm_port),
+            "town": town,
+            "tick": 1 / int(simulation_frequency),
+            "timeout": float(timeout),
+            "traffic": vehicles_count > 0,
+        }
+        self._ticks = int(simulation_frequency // policy_frequency)
+        depths = {"rgb": 3, "event": event_channels, "depth": 1}
+        self.observation_space: spaces.Space[Any] = spaces.Dict(
+            {name: spaces.Box(0, 255, (size, size, depths[name]), np.uint8) for name in self.modalities}
+        )
+        self.action_space = spaces.Box(-1.0, 1.0, shape=(2,), dtype=np.float32)
+        self.render_mode = render_mode
+        self.metadata = {**type(self).metadata, "render_fps": policy_frequency}
+        self._session: Session | None = None
+        self._episode: Episode | None = None
+        self._observation: Observation | None = None
+
+    # ---- the server ----
+
+    def _connect(self) -> Session:
+        try:
+            from sb3_have.envs.carla_vision.session import Server, Session
+        except ImportError as error:
+            if error.name != "carla":
+                raise
+            raise ImportError(
+                "CarlaVision-v0 needs the package carla: pip install 'sb3_have[carla]'. It exists for Python 3.10 to "
+                "3.12 on 64-bit Linux and Windows",
+                name="carla",
+            ) from error
+        session = Session(Server(**self._server))
+        # also when the environment is collected, or the program ends
+        self._finalizer = weakref.finalize(self, session.close)
+        return session
+
+    @contextmanager
+    def _cleaning_up(self) -> Iterator[None]:
+        """Whatever goes wrong, Ctrl-C included, leaves nothing on the server; a time-out is told apart by its cause."""
+        try:
+            yield
+        except BaseException as error:
+            session = self._session
+            self.close()
+            if session is None or not isinstance(error, RuntimeError):
+                raise
+            if session.lost:
+                raise session.connection_error("lost the CARLA server at") from error
+            if "time-out" in str(error):
+                raise TimeoutError(
+                    f"the CARLA server is alive but did not finish within {session.server.timeout} s; raise `timeout`"
+                ) from error
+            raise
+
+    def close(self) -> None:
+        """Remove everything from the server and disconnect. The next ``reset`` connects again."""
+        self._episode = None
+        if self._session is not None:
+            self._session.close()
+            self._finalizer.detach()
+            self._session = None
+
+    # ---- episodes ----
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observation, dict[str, Any]]:
+        """
+        Start an episode; connect to the server if there is no connection.
+
+        :param seed: seeds everything random about this and all following episodes
+        :param options: ``{"weather": ...}`` as in the constructor, for this episode only
+        :raises ValueError: for other options, an unknown weather, or a map without the road or the lanes asked for
+        :raises ConnectionError: if there is no server
+        :raises TimeoutError: if the server is alive and too slow
+        :raises RuntimeError: if there is no room for the cars, or a sensor failed
+        """
+        unknown = set(options or {}) - {"weather"}
+        if unknown:
+            raise ValueError(f"unknown reset options {sorted(unknown)}; the only one is 'weather'")
+        choices = _weather_choices(options["weather"]) if options else self.weathers
+        super().reset(seed=seed)
+        # A generator each: the traffic does not depend on the choice of weathers.
+        weather_rng, rng = (np.random.default_rng(draw) for draw in self.np_random.integers(2**63, size=2))
+        self.weather = choices[weather_rng.integers(len(choices))]
+        self._trip, self._steps = Trip(), 0
+        with self._cleaning_up():
+            if self._session is None:
+                self._session = self._connect()
+            from sb3_have.envs.carla_vision.episode import Episode, Plan
+
+            self._episode = Episode(self._session, Plan(**self._plan), self.weather, rng)
+            self._observation = self._episode.first_observation()
+        return self._observation, self._info()
+
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+        """
+        Hold ``action`` for one control step.
+
+        :param action: [throttle, steer], shape (2,), clipped to -1..1; throttle below 0 brakes, steer above 0 goes
+            right
+        :raises ValueError: if the action has another shape or is not finite
+        :raises gymnasium.error.ResetNeeded: before ``reset``, and after an exception
+        :raises ConnectionError: if the server has gone
+        :raises TimeoutError: if the server is alive and too slow
+        :raises RuntimeError: if a sensor failed
+        """
+        action = np.asarray(action, dtype=np.float64)
+        if action.shape != (2,) or not np.isfinite(action).all():
+            raise ValueError(f"action must be two finite numbers [throttle, steer], got {action!r}")
+        if self._episode is None:
+            raise gym.error.ResetNeeded("there is no episode (nor a connection after an error): call reset()")
+        if self._end_reason() is not None:
+            gym.logger.warn("step() called after the end of the episode; what it returns is undefined. Call reset().")
+        throttle, steer = (float(part) for part in np.clip(action, -1.0, 1.0))
+        dt: float = self._server["tick"]
+        with self._cleaning_up():
+            lanes = [self._episode.tick(throttle, steer) for _ in range(self._ticks)]
+            self._observation = self._episode.observation(self._ticks)
+            collisions = self._episode.collisions()
+        for lane in lanes:
+            self._trip = self._trip.tick(lane.lane_speed, lane.speed, dt, lane.offroad)
+        self._trip = self._trip.collide(collisions.ticks)
+        self._steps += 1
+        reason = self._end_reason()
+        speeds = [lane.lane_speed for lane in lanes]
+        reward = self._reward(speeds, dt, throttle, steer, collisions.impulse, reason in ("crash", "offroad"))
+        truncated = self.max_episode_steps is not None and self._steps >= self.max_episode_steps
+        return self._observation, reward, reason not in (None, "timeout"), truncated, self._info()
+
+    def _end_reason(self) -> str | None:
+        reasons = [
+            ("crash", self._trip.crashed(self.collision_ticks)),
+            ("offroad", self._trip.offroad),
+            ("standstill", self._trip.stuck(self.standstill_time)),
+            ("timeout", self.max_episode_steps is not None and self._steps >= self.max_episode_steps),
+        ]
+        return next((reason for reason, holds in reasons if holds), None)
+
+    def _info(self) -> dict[str, Any]:
+        assert self._episode is not None
+        return {
+            "distance": self._trip.distance,
+            "speed": self._episode.lane.speed,
+            "crashed": self._trip.crashed(self.collision_ticks),
+            "offroad": self._trip.offroad,
+            "weather": self.weather,
+            "end_reason": self._end_reason(),
+        }
+
+    def render(self) -> np.ndarray | None:
+        """The last observation as one uint8 picture (H, W, 3), its modalities side by side; None without a mode."""
+        if self.render_mode is None:
+            gym.logger.warn('render() needs render_mode="rgb_array", given to gym.make or the constructor.')
+            return None
+        if self._observation is None:
+            raise gym.error.ResetNeeded("nothing to render yet: call reset()")
+        return compose(self._observation)
+
+
+def _depth_options(given: Mapping[str, Any] | None) -> dict[str, Any]:
+    unknown = set(given or {}) - set(DEPTH_DEFAULTS)
+    if unknown:
+        raise ValueError(f"unknown depth option {sorted(unknown)}; the options are {', '.join(DEPTH_DEFAULTS)}")
+    options = {**DEPTH_DEFAULTS, **(given or {})}
+    encode_depth(np.empty(0), *options.values())
+    return options

@@ -1,0 +1,267 @@
+"""One episode on a CARLA server: who is put where, ticks, and what the sensors of the ego saw."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple, cast
+
+import carla
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_have.envs.carla_vision.geometry import LaneState, lane_state, spawn_transform
+from sb3_have.envs.carla_vision.rules import (
+    EGO_RANGE,
+    TRAFFIC_RANGE,
+    Pedals,
+    draw_place,
+    pedals,
+    steering_gain,
+)
+from sb3_have.envs.carla_vision.sensors import (
+    EVENT_GRACE,
+    Inbox,
+    copy_events,
+    copy_image,
+    decode_depth_image,
+    decode_dvs,
+    decode_rgb,
+    dvs_attributes,
+    impulse,
+)
+from sb3_have.envs.carla_vision.session import Session
+from sb3_have.envs.vision import Observation
+from sb3_have.sensors.depth import encode_depth
+from sb3_have.sensors.representations import encode_events, represent
+
+#: The roof camera: metres ahead of and above the car's centre on the ground, horizontal field of view [degrees].
+CAMERA: Final = {"x": 1.0, "z": 1.5}
+FIELD_OF_VIEW: Final = 60.0
+#: Places tried for a car before giving up.
+ATTEMPTS: Final = 20
+#: Ticks before the episode starts: cars fall onto the road, sensors begin to deliver.
+SETTLING: Final = 10
+
+_BLUEPRINTS: Final = {"rgb": "sensor.camera.rgb", "depth": "sensor.camera.depth", "event": "sensor.camera.dvs"}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What an episode consists of; the options of :class:`CarlaVisionEnv` by the same names."""
+
+    modalities: tuple[str, ...]
+    image_size: int
+    event: Mapping[str, Any]
+    depth: Mapping[str, Any]
+    vehicles_count: int
+    traffic_speed: tuple[float, float] | None
+    lanes_count: int
+    road_id: int
+    ego_vehicle: str
+    initial_speed: float
+    max_speed: float
+    steering_range: float | None
+
+
+class Tick(NamedTuple):
+    """What a simulation tick brought."""
+
+    frame: int
+    lane: LaneState
+
+
+class Collisions(NamedTuple):
+    """In how many ticks the ego collided, and the sum of the sizes of the impulses [N s]."""
+
+    ticks: int
+    impulse: float
+
+
+class Episode:
+    """
+    An episode that has started: the cars stand on the road, the sensors deliver.
+
+    :param session: The server.
+    :param plan: What it consists of.
+    :param weather: A preset of ``carla.WeatherParameters``.
+    :param rng: Source of everything random.
+    :raises RuntimeError: if there is no room for a car, or the server is lost.
+    """
+
+    def __init__(self, session: Session, plan: Plan, weather: str, rng: np.random.Generator) -> None:
+        self.session, self.plan = session, plan
+        self._dt = session.server.tick
+        session.destroy_actors()
+        session.world.set_weather(getattr(carla.WeatherParameters, weather))
+        if session.traffic_manager is not None:
+            session.traffic_manager.set_random_device_seed(int(rng.integers(2**31)))
+        blueprint = session.blueprints.find(plan.ego_vehicle)
+        self.ego = self._place(blueprint, EGO_RANGE, rng, "the ego vehicle")
+        lock = self.ego.get_physics_control().wheels[0].max_steer_angle
+        self._gain = steering_gain(plan.steering_range, lock)
+        for number in range(plan.vehicles_count):
+            self._add_traffic(rng, f"vehicle {number + 1} of {plan.vehicles_count}")
+        self._images = {name: self._camera(name, copy_image) for name in plan.modalities if name != "event"}
+        self._events = self._camera("event", copy_events) if "event" in plan.modalities else None
+        self._collisions: Inbox[float] = Inbox("collision", impulse)
+        self._listen(session.blueprints.find("sensor.other.collision"), carla.Transform(), self._collisions)
+        self._settle()
+
+    # ---- actors ----
+
+    def _place(
+        self, blueprint: carla.ActorBlueprint, s_range: tuple[float, float], rng: np.random.Generator, who: str
+    ) -> carla.Vehicle:
+        plan, road_map = self.plan, self.session.road_map
+        for _ in range(ATTEMPTS):
+            place = draw_place(rng, plan.lanes_count, s_range)
+            actor = self.session.spawn(blueprint, spawn_transform(road_map, plan.road_id, place))
+            if actor is not None:
+                return cast(carla.Vehicle, actor)
+        raise RuntimeError(
+            f"found no room for {who} in {ATTEMPTS} attempts, on lanes -1..-{plan.lanes_count} of road {plan.road_id} "
+            f"at s in {list(s_range)} m; are cars of other clients there? Otherwise lower `vehicles_count`"
+        )
+
+    def _add_traffic(self, rng: np.random.Generator, who: str) -> None:
+        session = self.session
+        models = [model for model in session.blueprints.filter("vehicle.*") if _is_car(model)]
+        models.sort(key=lambda model: model.id)
+        if not models:
+            raise RuntimeError("the server has no blueprint of a car (vehicle.* with base_type 'car')")
+        model = models[rng.integers(len(models))]
+        if model.has_attribute("color"):
+            colours = model.get_attribute("color").recommended_values
+            model.set_attribute("color", colours[rng.integers(len(colours))])
+        vehicle = self._place(model, TRAFFIC_RANGE, rng, who)
+        vehicle.set_autopilot(True, session.tm_port)
+        if self.plan.traffic_speed is not None and session.traffic_manager is not None:
+            kmh = 3.6 * float(rng.uniform(*self.plan.traffic_speed))
+            session.traffic_manager.set_desired_speed(vehicle, kmh)
+
+    def _camera(self, name: str, read: Callable[[Any], Any]) -> Inbox[Any]:
+        plan = self.plan
+        blueprint = self.session.blueprints.find(_BLUEPRINTS[name])
+        attributes = {
+            "image_size_x": str(plan.image_size),
+            "image_size_y": str(plan.image_size),
+            "fov": str(FIELD_OF_VIEW),
+            **(dvs_attributes(plan.event) if name == "event" else {}),
+        }
+        for attribute, value in attributes.items():
+            blueprint.set_attribute(attribute, value)
+        inbox: Inbox[Any] = Inbox(name, read)
+        self._listen(blueprint, carla.Transform(carla.Location(**CAMERA)), inbox)
+        return inbox
+
+    def _listen(self, blueprint: carla.ActorBlueprint, transform: carla.Transform, inbox: Inbox[Any]) -> None:
+        sensor = self.session.spawn(blueprint, transform, self.ego)
+        if sensor is None:
+            raise RuntimeError(f"the server refused the {inbox.name} sensor ({blueprint.id}); its log says why")
+        cast(carla.Sensor, sensor).listen(inbox)
+
+    # ---- time ----
+
+    def _settle(self) -> None:
+        self.ego.apply_control(carla.VehicleControl(0.0, 0.0, 1.0, True))
+        for remaining in reversed(range(SETTLING)):
+            if remaining == 0:
+                self.ego.apply_control(carla.VehicleControl())
+                if self.plan.initial_speed > 0:
+                    along = self.ego.get_transform().get_forward_vector()
+                    self.ego.set_target_velocity(along * self.plan.initial_speed)
+            self.frame = self.session.tick()
+        self.lane = self._lane()
+        self._collisions.drain()
+
+    def tick(self, throttle: float, steer: float) -> LaneState:
+        """
+        One simulation tick.
+
+        :param throttle: Of the action, -1..1.
+        :param steer: Of the action, -1..1.
+        :return: How the ego moves after it.
+        """
+        control: Pedals = pedals(throttle, steer, self.lane.speed, self.plan.max_speed, self._gain)
+        self.ego.apply_control(carla.VehicleControl(*control))
+        self.frame = self.session.tick()
+        self.lane = self._lane()
+        return self.lane
+
+    def _lane(self) -> LaneState:
+        return lane_state(self.session.road_map, self.ego.get_location(), self.ego.get_velocity())
+
+    # ---- sensors ----
+
+    def collisions(self) -> Collisions:
+        """Those reported since the last call. One that is reported late counts when it is: none is lost."""
+        reports = self._collisions.drain()
+        return Collisions(len({frame for frame, _ in reports}), sum(size for _, size in reports))
+
+    def first_observation(self) -> Observation:
+        """What is seen at the start; no events yet."""
+        observation = self._see()
+        if self._events is not None:
+            self._events.drain(self.frame, EVENT_GRACE)
+            observation["event"] = self._event_image([], 0, 1)
+        self._begin_step()
+        return self._in_order(observation)
+
+    def observation(self, ticks: int) -> Observation:
+        """
+        What was seen in a control step.
+
+        The image of events holds those of the frames after the last observation. Events that arrive after the images
+        of the last tick and :data:`EVENT_GRACE` are dropped: their step is over.
+
+        :param ticks: Number of simulation ticks since the last observation.
+        :raises TimeoutError: if an image does not come.
+        :raises RuntimeError: if a callback failed or an image is of another frame.
+        """
+        observation = self._see()
+        if self._events is not None:
+            arrays = [data for frame, data in self._events.drain(self.frame, EVENT_GRACE) if frame > self._step_frame]
+            observation["event"] = self._event_image(arrays, self._step_time, ticks)
+        self._begin_step()
+        return self._in_order(observation)
+
+    def _begin_step(self) -> None:
+        self._step_frame = self.frame
+        self._step_time = int(1e9 * self.session.world.get_snapshot().timestamp.elapsed_seconds)
+
+    def _see(self) -> Observation:
+        timeout = self.session.server.timeout
+        pixels = {name: inbox.at(self.frame, timeout) for name, inbox in self._images.items()}
+        observation: Observation = {}
+        if "rgb" in pixels:
+            observation["rgb"] = decode_rgb(pixels["rgb"])
+        if "depth" in pixels:
+            metres = decode_depth_image(pixels["depth"])
+            observation["depth"] = encode_depth(metres, *self.plan.depth.values())[..., None]
+        return observation
+
+    def _event_image(self, arrays: list[NDArray[np.void]], start: int, ticks: int) -> NDArray[np.uint8]:
+        size, options = self.plan.image_size, self.plan.event
+        duration = ticks * self._dt
+        events = decode_dvs(arrays, start, duration)
+        pixel = events["y"].astype(np.int64) * size + events["x"]
+        values = represent(
+            pixel,
+            events["t"],
+            events["p"].astype(np.float64),
+            options["bins"],
+            0.0,
+            duration,
+            size,
+            size,
+            options["representation"],
+        )
+        return encode_events(values, options["representation"])
+
+    def _in_order(self, observation: Observation) -> Observation:
+        return {name: observation[name] for name in self.plan.modalities}
+
+
+def _is_car(model: carla.ActorBlueprint) -> bool:
+    return model.has_attribute("base_type") and model.get_attribute("base_type").as_str() == "car"

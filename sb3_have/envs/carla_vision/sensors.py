@@ -1,0 +1,231 @@
+"""From CARLA's sensors to images: callbacks that copy and never raise, a queue each, frames that match, decoding."""
+
+from __future__ import annotations
+
+import math
+import queue
+import time
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
+from typing import Any, Final, Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_have.sensors.event_camera import EVENT_DTYPE
+
+T = TypeVar("T")
+Bytes = NDArray[np.uint8]
+
+#: One event as CARLA sends it; ``t`` is simulation time in nanoseconds.
+DVS_DTYPE: Final = np.dtype([("x", "<u2"), ("y", "<u2"), ("t", "<i8"), ("pol", "?")])
+#: How long to wait for the events of a tick that has ended [s]. A tick without events sends nothing at all, so this is
+#: not a time-out: it passes whenever nothing moves.
+EVENT_GRACE: Final = 0.02
+#: CARLA's depth ends here [m]; what lies beyond, the sky, reads as this.
+DEPTH_FAR: Final = 1000.0
+
+#: Defaults of the event camera. Threshold and mismatch are those of the paper's experiments.
+EVENT_DEFAULTS: Final[Mapping[str, Any]] = MappingProxyType(
+    {
+        "bins": 5,
+        "representation": "sbt",
+        "threshold": 0.3,
+        "threshold_sigma": 0.05,
+        "refractory": 0.0,
+        "mapping": "log",
+        "log_eps": 1e-3,
+    }
+)
+# Options of the simulated event camera that CARLA's has no counterpart for, with their value for "absent" and a remedy.
+_ABSENT: Final[Mapping[str, tuple[Any, str]]] = MappingProxyType(
+    {
+        "subframes": (None, "it renders once per simulation tick; raise simulation_frequency instead"),
+        "leak_rate": (0.0, "it has no leak noise; leave it out"),
+        "shot_rate": (0.0, "it has no shot noise; leave it out"),
+        "cutoff_hz": (None, "its photoreceptor has no bandwidth; leave it out"),
+        "seed": (None, "its noise takes no seed; leave it out"),
+    }
+)
+
+
+class _Data(Protocol):
+    @property
+    def frame(self) -> int: ...
+
+
+class Inbox(Generic[T]):
+    """
+    What one sensor has sent. An instance is the callback to give to ``sensor.listen``.
+
+    CARLA calls it from a thread of its own, frees the buffer when it returns, and swallows what it raises: so it copies
+    at once, and keeps an exception for whoever reads next.
+
+    :param name: Of the sensor, for messages.
+    :param read: Copies what is wanted out of the data.
+    """
+
+    def __init__(self, name: str, read: Callable[[Any], T]) -> None:
+        self.name = name
+        self._read = read
+        self._items: queue.SimpleQueue[tuple[int, T] | Exception] = queue.SimpleQueue()
+
+    def __call__(self, data: _Data) -> None:
+        try:
+            self._items.put((data.frame, self._read(data)))
+        except Exception as error:
+            self._items.put(error)
+
+    def at(self, frame: int, timeout: float) -> T:
+        """
+        The data of one frame; older data is dropped.
+
+        :param frame: As ``world.tick`` returned it.
+        :param timeout: In seconds.
+        :raises TimeoutError: if it does not come in time.
+        :raises RuntimeError: if a later frame comes instead, or the callback has failed.
+        """
+        deadline = time.monotonic() + timeout
+        while True:
+            item = self._next(deadline)
+            if item is None:
+                raise TimeoutError(
+                    f"no data of frame {frame} from the {self.name} sensor within {timeout} s although the server "
+                    "ticks; raise `timeout` if it renders slower than that"
+                )
+            got, data = item
+            if got == frame:
+                return data
+            if got > frame:
+                raise RuntimeError(
+                    f"the {self.name} sensor sent frame {got} when frame {frame} was due: does another client tick "
+                    "this server too? Give each environment a server of its own"
+                )
+
+    def drain(self, frame: int = -1, grace: float = 0.0) -> list[tuple[int, T]]:
+        """
+        All that has come, with the frames it belongs to, for sensors that send only when there is something to tell.
+
+        :param frame: Wait until something of this frame has come ...
+        :param grace: ... for so many seconds at most.
+        :raises RuntimeError: if the callback has failed.
+        """
+        items: list[tuple[int, T]] = []
+        deadline = time.monotonic() + grace
+        while True:
+            complete = any(got >= frame for got, _ in items)
+            item = self._next(0.0 if complete else deadline)
+            if item is None:
+                return items
+            items.append(item)
+
+    def _next(self, deadline: float) -> tuple[int, T] | None:
+        try:
+            item = self._items.get(timeout=max(0.0, deadline - time.monotonic()))
+        except queue.Empty:
+            return None
+        if isinstance(item, Exception):
+            raise RuntimeError(f"the callback of the {self.name} sensor failed: {item!r}") from item
+        return item
+
+
+def copy_image(image: Any) -> Bytes:
+    """The pixels of a ``carla.Image``: blue, green, red, alpha, uint8 (height, width, 4)."""
+    return np.frombuffer(image.raw_data, dtype=np.uint8).reshape(image.height, image.width, 4).copy()
+
+
+def copy_events(events: Any) -> NDArray[np.void]:
+    """The events of a ``carla.DVSEventArray``, of :data:`DVS_DTYPE`."""
+    return np.frombuffer(events.raw_data, dtype=DVS_DTYPE).copy()
+
+
+def impulse(collision: Any) -> float:
+    """The size of the impulse of a ``carla.CollisionEvent`` [N s]."""
+    force = collision.normal_impulse
+    return math.sqrt(force.x**2 + force.y**2 + force.z**2)
+
+
+def decode_rgb(pixels: Bytes) -> Bytes:
+    """
+    Colours of a camera's pixels.
+
+    :param pixels: uint8 (H, W, 4): blue, green, red, alpha.
+    :return: uint8 (H, W, 3): red, green, blue.
+    """
+    return np.ascontiguousarray(pixels[..., 2::-1])
+
+
+def decode_depth_image(pixels: Bytes) -> NDArray[np.float32]:
+    """
+    Distance along the optical axis in a depth camera's pixels: 1000 (R + 256 G + 65536 B) / (256^3 - 1) metres.
+
+    :param pixels: uint8 (H, W, 4): blue, green, red, alpha.
+    :return: float32 (H, W) metres; infinite where the code is the greatest of all, in the sky.
+    """
+    blue, green, red = (pixels[..., channel].astype(np.uint32) for channel in range(3))
+    code = red + 256 * green + 65536 * blue
+    metres = DEPTH_FAR * code / (256**3 - 1)
+    return np.where(code == 256**3 - 1, np.inf, metres).astype(np.float32)
+
+
+def decode_dvs(arrays: Iterable[NDArray[np.void]], start: int, duration: float) -> NDArray[np.void]:
+    """
+    Events of the ticks of one control step, in the package's own form.
+
+    :param arrays: Of :data:`DVS_DTYPE`, an array for each tick that had events.
+    :param start: Simulation time at the start of the step [ns].
+    :param duration: Length of the step [s].
+    :return: Of :data:`sb3_have.sensors.EVENT_DTYPE`; ``t`` in seconds since the start, within 0..``duration`` also
+        where CARLA's rounding to nanoseconds leaves it a little outside.
+    """
+    raw = np.concatenate([np.empty(0, dtype=DVS_DTYPE), *arrays])
+    events = np.empty(len(raw), dtype=EVENT_DTYPE)
+    events["x"], events["y"] = raw["x"], raw["y"]
+    events["t"] = np.clip((raw["t"] - start) * 1e-9, 0.0, duration)
+    events["p"] = np.where(raw["pol"], 1, -1)
+    return events
+
+
+def event_options(given: Mapping[str, Any] | None) -> dict[str, Any]:
+    """
+    :data:`EVENT_DEFAULTS` with overrides.
+
+    :param given: Options as HighwayVision-v0 takes them. Those that CARLA's sensor has no counterpart for may be given
+        only as absent (``leak_rate=0``).
+    :raises ValueError: on an unknown option, or one that CARLA cannot honour.
+    """
+    given = dict(given or {})
+    for name, (absent, remedy) in _ABSENT.items():
+        if name in given and (value := given.pop(name)) != absent:
+            raise ValueError(f"event {name}={value!r} means nothing to CARLA's event camera: {remedy}")
+    unknown = set(given) - set(EVENT_DEFAULTS)
+    if unknown:
+        raise ValueError(f"unknown event option {sorted(unknown)}; the options are {', '.join(EVENT_DEFAULTS)}")
+    return {**EVENT_DEFAULTS, **given}
+
+
+def dvs_attributes(options: Mapping[str, Any]) -> dict[str, str]:
+    """
+    Attributes of the blueprint ``sensor.camera.dvs``.
+
+    :param options: As :func:`event_options` returns them.
+    :raises ValueError: on a value that the sensor cannot have.
+    """
+    thresholds = options["threshold"]
+    positive, negative = thresholds if np.ndim(thresholds) else (thresholds, thresholds)
+    if not (np.isfinite([positive, negative]).all() and min(positive, negative) > 0):
+        raise ValueError(f"event threshold must be positive, or a pair of such, got {thresholds!r}")
+    for name in ("threshold_sigma", "refractory", "log_eps"):
+        if not (np.isfinite(options[name]) and options[name] >= 0):
+            raise ValueError(f"event {name} must be >= 0, got {options[name]!r}")
+    if options["mapping"] not in ("log", "identity"):
+        raise ValueError(f"CARLA's event camera maps light by 'log' or 'identity', got {options['mapping']!r}")
+    return {
+        "positive_threshold": str(float(positive)),
+        "negative_threshold": str(float(negative)),
+        "sigma_positive_threshold": str(float(options["threshold_sigma"])),
+        "sigma_negative_threshold": str(float(options["threshold_sigma"])),
+        "refractory_period_ns": str(round(1e9 * options["refractory"])),
+        "use_log": "true" if options["mapping"] == "log" else "false",
+        "log_eps": str(float(options["log_eps"])),
+    }

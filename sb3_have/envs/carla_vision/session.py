@@ -1,0 +1,242 @@
+"""The connection to a CARLA server: what was changed there is undone, what was put there is removed, come what may."""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Final, cast
+
+import carla
+import gymnasium as gym
+
+from sb3_have.envs.carla_vision.errors import CarlaConnectionError
+
+#: Loading a map takes longer than any other call [s].
+LOAD_TIMEOUT: Final = 120.0
+#: How long to wait for a sign of life before giving a server up [s].
+PING_TIMEOUT: Final = 2.0
+
+# Traffic managers live in threads of this process, on ports. One whose server died stays there, unusable.
+_dead_ports: set[int] = set()
+
+
+@dataclass(frozen=True)
+class Server:
+    """
+    Which server to connect to, and how it is to run.
+
+    :param host: Its name or address.
+    :param port: Its RPC port.
+    :param tm_port: Port for the traffic manager; environments of different processes need different ones.
+    :param town: The map.
+    :param tick: Length of a simulation tick [s].
+    :param timeout: For every call [s].
+    :param traffic: Whether there will be traffic, and so a traffic manager.
+    """
+
+    host: str
+    port: int
+    tm_port: int
+    town: str
+    tick: float
+    timeout: float
+    traffic: bool
+
+
+class Session:
+    """
+    A server in synchronous mode, with the actors of one episode.
+
+    :param server: Which and how.
+    :raises CarlaConnectionError: if there is none.
+    :raises ValueError: if it does not have the town.
+    """
+
+    client: carla.Client
+    world: carla.World
+    road_map: carla.Map
+    traffic_manager: carla.TrafficManager | None = None
+
+    def __init__(self, server: Server) -> None:
+        self.server = server
+        self.lost = False
+        #: All actors of this session bear it as their role, so that none is overlooked.
+        self.role = f"sb3_have-{uuid.uuid4().hex}"
+        self._actors: list[carla.Actor] = []
+        self._spawning = False
+        self._closed = False
+        self._undo = ExitStack()
+        try:
+            self._connect()
+        except BaseException:
+            self.close()
+            raise
+
+    def _connect(self) -> None:
+        server = self.server
+        try:
+            self.client = carla.Client(server.host, server.port)
+            self.client.set_timeout(server.timeout)
+            theirs = self.client.get_server_version()
+            self.world = self.client.get_world()
+        except RuntimeError as error:
+            self.lost = True
+            raise self.connection_error("no CARLA server at") from error
+        ours = self.client.get_client_version()
+        if ours != theirs:
+            gym.logger.warn(
+                f"CARLA client {ours} talks to a server of version {theirs}: calls may fail or mean something else. "
+                f"Install the client of that version: pip install carla=={theirs}"
+            )
+        original = self.world.get_settings()
+        if original.synchronous_mode:
+            gym.logger.warn(
+                f"the CARLA server at {server.host}:{server.port} is in synchronous mode already: another client "
+                "drives it, or died without cleaning up. It will be left in asynchronous mode."
+            )
+            original.synchronous_mode, original.fixed_delta_seconds = False, None
+        self._load_town()
+        settings = self.world.get_settings()
+        settings.synchronous_mode, settings.fixed_delta_seconds = True, server.tick
+        settings.no_rendering_mode = False
+        # Undone in the reverse order: each is noted before it is done, so that an interrupt between cannot hide it.
+        self._undo.callback(self._drop_traffic_manager)
+        self._undo.callback(lambda: self.world.apply_settings(original))
+        self.world.apply_settings(settings)
+        self.tm_port = server.tm_port
+        if server.traffic:
+            self._start_traffic_manager()
+        self._undo.callback(self.destroy_actors)
+        self.blueprints = self.world.get_blueprint_library()
+
+    def _load_town(self) -> None:
+        town = self.server.town
+        self.road_map = self.world.get_map()
+        if self.road_map.name.rsplit("/", 1)[-1] == town:
+            return  # loading it again would leak memory on the server
+        towns = sorted({name.rsplit("/", 1)[-1] for name in self.client.get_available_maps()})
+        if town not in towns:
+            raise ValueError(f"the server has no town {town!r}; it has {', '.join(towns)}")
+        self.client.set_timeout(max(self.server.timeout, LOAD_TIMEOUT))
+        self.world = self.client.load_world(town)
+        self.client.set_timeout(self.server.timeout)
+        self.road_map = self.world.get_map()
+
+    def _start_traffic_manager(self) -> None:
+        while self.tm_port in _dead_ports:
+            self.tm_port += 1
+        try:
+            self.traffic_manager = self.client.get_trafficmanager(self.tm_port)
+        except RuntimeError as error:
+            raise RuntimeError(
+                f"no traffic manager on port {self.tm_port}: {error}. If the port is taken, choose another `tm_port`"
+            ) from error
+        self._undo.callback(self.traffic_manager.set_synchronous_mode, False)
+        self.traffic_manager.set_synchronous_mode(True)
+
+    def _drop_traffic_manager(self) -> None:
+        # It would go on polling the server, and abort the process when that is shut down.
+        if self.traffic_manager is not None:
+            self.traffic_manager.shut_down()
+            self.traffic_manager = None
+
+    # ---- actors ----
+
+    def spawn(
+        self, blueprint: carla.ActorBlueprint, transform: carla.Transform, parent: carla.Actor | None = None
+    ) -> carla.Actor | None:
+        """
+        Put an actor into the world; :meth:`destroy_actors` and :meth:`close` remove it.
+
+        :param blueprint: Of the actor; its role is set here.
+        :param transform: Where, relative to the parent if there is one.
+        :param parent: What to fix it to.
+        :return: None if something is in the way.
+        """
+        blueprint.set_attribute("role_name", self.role)
+        with self._noticed():
+            # an Actor or None, whatever the stub says
+            actor: carla.Actor | None = self.world.try_spawn_actor(blueprint, transform, parent)
+            if actor is None:
+                self.client.get_server_version()  # None also stands for a lost connection; this would raise then
+            else:
+                self._actors.append(actor)
+        return actor
+
+    @contextmanager
+    def _noticed(self) -> Iterator[None]:
+        """An interrupt between the server's answer and our note of it leaves an actor that only the server knows."""
+        self._spawning = True
+        yield
+        self._spawning = False  # not in a `finally`: an exception leaves it standing for `destroy_actors` to read
+
+    def destroy_actors(self) -> None:
+        """Stop and remove every sensor, then every vehicle, of this session."""
+        if self._spawning:
+            self.world.tick(self.server.timeout)  # new actors are listed from the next tick on
+            known = {actor.id for actor in self._actors}
+            everybody = cast(Iterable[carla.Actor], self.world.get_actors())
+            mine = [actor for actor in everybody if actor.attributes.get("role_name") == self.role]
+            self._actors += [actor for actor in mine if actor.id not in known]
+            self._spawning = False
+        self._actors.sort(key=lambda actor: not actor.type_id.startswith("sensor."))  # these first
+        for actor in self._actors:
+            if actor.type_id.startswith("sensor."):
+                sensor = cast(carla.Sensor, actor)
+                if sensor.is_listening():
+                    sensor.stop()
+        if self._actors:
+            destroy = [carla.command.DestroyActor(actor.id) for actor in self._actors]
+            failures = [reply.error for reply in self.client.apply_batch_sync(destroy, False) if reply.has_error()]
+            failures = [failure for failure in failures if "not found" not in failure]  # gone already
+            if failures:
+                gym.logger.warn(f"the CARLA server did not remove {len(failures)} actors: {failures[0]}")
+        self._actors.clear()
+
+    def tick(self) -> int:
+        """Let one tick of simulated time pass; its frame."""
+        return self.world.tick(self.server.timeout)
+
+    # ---- ends ----
+
+    def connection_error(self, what: str) -> CarlaConnectionError:
+        """An error that says where no server is, and how to start one."""
+        server = self.server
+        return CarlaConnectionError(
+            f"{what} {server.host}:{server.port}; start it with "
+            f"`./CarlaUE4.sh -RenderOffScreen -carla-rpc-port={server.port}`"
+        )
+
+    def close(self) -> None:
+        """
+        Remove the actors, restore the settings of the server. Calling it again does nothing.
+
+        A server that has gone is left alone: each call would wait for its time-out, and a traffic manager that cannot
+        reach its server aborts the whole process.
+        """
+        if self._closed:
+            return
+        if not self.lost and hasattr(self, "world"):
+            self.lost = not self._alive()
+        if self.lost:
+            self._undo.pop_all()
+            self._actors.clear()
+            if self.traffic_manager is not None:
+                _dead_ports.add(self.tm_port)
+                self.traffic_manager = None
+        try:
+            self._undo.close()
+        except RuntimeError as error:
+            gym.logger.warn(f"cleaning up the CARLA server {self.server.host}:{self.server.port} failed: {error}")
+        self._closed = True
+
+    def _alive(self) -> bool:
+        try:
+            self.client.set_timeout(min(self.server.timeout, PING_TIMEOUT))
+            self.client.get_server_version()
+            self.client.set_timeout(self.server.timeout)
+        except RuntimeError:
+            return False
+        return True
