@@ -218,6 +218,10 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
     # ---- the server ----
 
     def _connect(self) -> Session:
+        if self._session is not None and not self._session.usable():
+            self.close()  # the server was restarted, or loaded another world, since the last episode
+        if self._session is not None:
+            return self._session
         try:
             from sb3_have.envs.carla_vision.session import Server, Session
         except ImportError as error:
@@ -228,9 +232,10 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
                 "3.12 on 64-bit Linux and Windows",
                 name="carla",
             ) from error
-        session = Session(Server(**self._server))
+        session = self._session = Session(Server(**self._server))
         # also when the environment is collected, or the program ends
         self._finalizer = weakref.finalize(self, session.close)
+        session.connect()
         return session
 
     @contextmanager
@@ -284,11 +289,10 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
         self.weather = choices[weather_rng.integers(len(choices))]
         self._trip, self._steps = Trip(), 0
         with self._cleaning_up():
-            if self._session is None:
-                self._session = self._connect()
+            session = self._connect()
             from sb3_have.envs.carla_vision.episode import Episode, Plan
 
-            self._episode = Episode(self._session, Plan(**self._plan), self.weather, rng)
+            self._episode = Episode(session, Plan(**self._plan), self.weather, rng)
             self._observation = self._episode.first_observation()
         return self._observation, self._info()
 
@@ -362,5 +366,10 @@ def _depth_options(given: Mapping[str, Any] | None) -> dict[str, Any]:
     if unknown:
         raise ValueError(f"unknown depth option {sorted(unknown)}; the options are {', '.join(DEPTH_DEFAULTS)}")
     options = {**DEPTH_DEFAULTS, **(given or {})}
-    encode_depth(np.empty(0), *options.values())
+    encode_depth(np.empty(0), *options.values())  # complains about a wrong option now, not at reset
+    if options["encoding"] == "log" and "max" in (given or {}):
+        raise ValueError(
+            f"depth max={options['max']!r} has no effect with encoding 'log', whose range is fixed; leave it out or "
+            "choose encoding 'clipped' or 'inverse'"
+        )
     return options

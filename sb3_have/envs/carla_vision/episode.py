@@ -100,8 +100,7 @@ class Episode:
         self.ego = self._place(blueprint, EGO_RANGE, rng, "the ego vehicle")
         lock = self.ego.get_physics_control().wheels[0].max_steer_angle
         self._gain = steering_gain(plan.steering_range, lock)
-        for number in range(plan.vehicles_count):
-            self._add_traffic(rng, f"vehicle {number + 1} of {plan.vehicles_count}")
+        self._add_traffic(rng)
         self._images = {name: self._camera(name, copy_image) for name in plan.modalities if name != "event"}
         self._events = self._camera("event", copy_events) if "event" in plan.modalities else None
         self._collisions: Inbox[float] = Inbox("collision", impulse)
@@ -124,21 +123,24 @@ class Episode:
             f"at s in {list(s_range)} m; are cars of other clients there? Otherwise lower `vehicles_count`"
         )
 
-    def _add_traffic(self, rng: np.random.Generator, who: str) -> None:
-        session = self.session
+    def _add_traffic(self, rng: np.random.Generator) -> None:
+        session, plan = self.session, self.plan
+        if session.traffic_manager is None:
+            return
         models = [model for model in session.blueprints.filter("vehicle.*") if _is_car(model)]
         models.sort(key=lambda model: model.id)
         if not models:
             raise RuntimeError("the server has no blueprint of a car (vehicle.* with base_type 'car')")
-        model = models[rng.integers(len(models))]
-        if model.has_attribute("color"):
-            colours = model.get_attribute("color").recommended_values
-            model.set_attribute("color", colours[rng.integers(len(colours))])
-        vehicle = self._place(model, TRAFFIC_RANGE, rng, who)
-        vehicle.set_autopilot(True, session.tm_port)
-        if self.plan.traffic_speed is not None and session.traffic_manager is not None:
-            kmh = 3.6 * float(rng.uniform(*self.plan.traffic_speed))
-            session.traffic_manager.set_desired_speed(vehicle, kmh)
+        for number in range(1, plan.vehicles_count + 1):
+            model = models[rng.integers(len(models))]
+            if model.has_attribute("color"):
+                colours = model.get_attribute("color").recommended_values
+                model.set_attribute("color", colours[rng.integers(len(colours))])
+            vehicle = self._place(model, TRAFFIC_RANGE, rng, f"vehicle {number} of {plan.vehicles_count}")
+            vehicle.set_autopilot(True, session.tm_port)
+            if plan.traffic_speed is not None:
+                kmh = 3.6 * float(rng.uniform(*plan.traffic_speed))
+                session.traffic_manager.set_desired_speed(vehicle, kmh)
 
     def _camera(self, name: str, read: Callable[[Any], Any]) -> Inbox[Any]:
         plan = self.plan

@@ -82,7 +82,7 @@ class Reward:
 
 
 class Trip(NamedTuple):
-    """What an episode has come to: metres along the lane, ticks with a collision, seconds without moving, the road left."""
+    """An episode so far: metres along the lane, ticks with a collision, seconds without moving, the road left."""
 
     distance: float = 0.0
     collisions: int = 0

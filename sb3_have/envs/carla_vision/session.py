@@ -16,7 +16,9 @@ from sb3_have.envs.carla_vision.errors import CarlaConnectionError
 #: Loading a map takes longer than any other call [s].
 LOAD_TIMEOUT: Final = 120.0
 #: How long to wait for a sign of life before giving a server up [s].
-PING_TIMEOUT: Final = 2.0
+PING_TIMEOUT: Final = 5.0
+#: The roles of all actors begin so.
+ROLE: Final = "sb3_have-"
 
 # Traffic managers live in threads of this process, on ports. One whose server died stays there, unusable.
 _dead_ports: set[int] = set()
@@ -47,11 +49,9 @@ class Server:
 
 class Session:
     """
-    A server in synchronous mode, with the actors of one episode.
+    A server in synchronous mode, with the actors of one episode, between :meth:`connect` and :meth:`close`.
 
     :param server: Which and how.
-    :raises CarlaConnectionError: if there is none.
-    :raises ValueError: if it does not have the town.
     """
 
     client: carla.Client
@@ -63,18 +63,19 @@ class Session:
         self.server = server
         self.lost = False
         #: All actors of this session bear it as their role, so that none is overlooked.
-        self.role = f"sb3_have-{uuid.uuid4().hex}"
+        self.role = ROLE + uuid.uuid4().hex
         self._actors: list[carla.Actor] = []
         self._spawning = False
         self._closed = False
         self._undo = ExitStack()
-        try:
-            self._connect()
-        except BaseException:
-            self.close()
-            raise
 
-    def _connect(self) -> None:
+    def connect(self) -> None:
+        """
+        Connect, and take the server over.
+
+        :raises CarlaConnectionError: if there is none.
+        :raises ValueError: if it does not have the town.
+        """
         server = self.server
         try:
             self.client = carla.Client(server.host, server.port)
@@ -90,8 +91,9 @@ class Session:
                 f"CARLA client {ours} talks to a server of version {theirs}: calls may fail or mean something else. "
                 f"Install the client of that version: pip install carla=={theirs}"
             )
-        original = self.world.get_settings()
-        if original.synchronous_mode:
+        original, weather = self.world.get_settings(), self.world.get_weather()
+        abandoned = original.synchronous_mode
+        if abandoned:
             gym.logger.warn(
                 f"the CARLA server at {server.host}:{server.port} is in synchronous mode already: another client "
                 "drives it, or died without cleaning up. It will be left in asynchronous mode."
@@ -104,11 +106,14 @@ class Session:
         # Undone in the reverse order: each is noted before it is done, so that an interrupt between cannot hide it.
         self._undo.callback(self._drop_traffic_manager)
         self._undo.callback(lambda: self.world.apply_settings(original))
+        self._undo.callback(lambda: self.world.set_weather(weather))
         self.world.apply_settings(settings)
         self.tm_port = server.tm_port
         if server.traffic:
             self._start_traffic_manager()
         self._undo.callback(self.destroy_actors)
+        if abandoned:
+            self._find_actors(ROLE)  # whoever died may have left some behind
         self.blueprints = self.world.get_blueprint_library()
 
     def _load_town(self) -> None:
@@ -175,11 +180,7 @@ class Session:
     def destroy_actors(self) -> None:
         """Stop and remove every sensor, then every vehicle, of this session."""
         if self._spawning:
-            self.world.tick(self.server.timeout)  # new actors are listed from the next tick on
-            known = {actor.id for actor in self._actors}
-            everybody = cast(Iterable[carla.Actor], self.world.get_actors())
-            mine = [actor for actor in everybody if actor.attributes.get("role_name") == self.role]
-            self._actors += [actor for actor in mine if actor.id not in known]
+            self._find_actors(self.role)
             self._spawning = False
         self._actors.sort(key=lambda actor: not actor.type_id.startswith("sensor."))  # these first
         for actor in self._actors:
@@ -194,6 +195,14 @@ class Session:
             if failures:
                 gym.logger.warn(f"the CARLA server did not remove {len(failures)} actors: {failures[0]}")
         self._actors.clear()
+
+    def _find_actors(self, role: str) -> None:
+        """Note those of a role, or roles that begin so, that only the server knows."""
+        self.tick()  # new actors are listed from the next tick on
+        known = {actor.id for actor in self._actors}
+        everybody = cast(Iterable[carla.Actor], self.world.get_actors())
+        found = [actor for actor in everybody if actor.attributes.get("role_name", "").startswith(role)]
+        self._actors += [actor for actor in found if actor.id not in known]
 
     def tick(self) -> int:
         """Let one tick of simulated time pass; its frame."""
@@ -231,6 +240,13 @@ class Session:
         except RuntimeError as error:
             gym.logger.warn(f"cleaning up the CARLA server {self.server.host}:{self.server.port} failed: {error}")
         self._closed = True
+
+    def usable(self) -> bool:
+        """Whether the server is there, its world is the one connected to, and it still waits for our ticks."""
+        try:
+            return self._alive() and self.world.get_settings().synchronous_mode
+        except RuntimeError:
+            return False  # another world has been loaded
 
     def _alive(self) -> bool:
         try:
