@@ -90,17 +90,21 @@ def test_depth_returns_come_and_go_only_where_the_failure_says_so(severity: int)
         assert (failed > 0).sum() < there.sum()
 
 
-def test_readouts_that_stop_early_lose_the_last_rows() -> None:
+def test_dead_banks_lose_or_hold_the_last_columns() -> None:
     for sensor, blank in (("rgb", 0), ("event", 128), ("depth", 0)):
-        image = np.full((SIZE, SIZE, 5), 77, np.uint8)
+        image = np.full((30, 48, 5), 77, np.uint8)
         for severity, kept in ((1, 32), (2, 16), (3, 0)):
             failed = corrupt("black", sensor, severity, image)
-            assert (failed[:kept] == 77).all() and (failed[kept:] == blank).all()
+            assert (failed[:, :kept] == 77).all() and (failed[:, kept:] == blank).all()
             past = np.full_like(image, 5)
             held = f.hold(image, np.random.default_rng(0), past, **FAILURES["frozen"][sensor].at(severity))
-            assert (held[:kept] == 77).all() and (held[kept:] == 5).all()
-    vector = corrupt("black", "vector", 3)
-    np.testing.assert_array_equal(vector, np.clip(np.zeros(16), LOW, HIGH))  # 5 is the nearest to 0 that 5..9 has
+            assert (held[:, :kept] == 77).all() and (held[:, kept:] == 5).all()
+    vector, past = example("vector"), example("vector", 4)
+    for severity, kept in ((1, 11), (2, 5), (3, 0)):
+        lost, held = corrupt("black", "vector", severity), corrupt("frozen", "vector", severity)
+        np.testing.assert_array_equal(lost[:kept], vector[:kept])
+        np.testing.assert_array_equal(lost[kept:], np.clip(np.zeros(16), LOW, HIGH)[kept:])  # of 5..9, 5 is nearest 0
+        np.testing.assert_array_equal(held, np.r_[vector[:kept], past[kept:]])
 
 
 def test_noise_of_colour_and_depth_has_its_sigma() -> None:

@@ -293,12 +293,12 @@ def test_failures_are_nested_and_all_of_them_told() -> None:
     np.testing.assert_array_equal(np.flatnonzero(active(truths)), range(6))
     np.testing.assert_array_equal(np.flatnonzero(active(truths, "rgb", "overexposure")), range(4, 8))
     np.testing.assert_array_equal(np.flatnonzero(active(truths, "depth", "depth_dropout")), [2, 3])
-    assert (observations[5]["rgb"][14:] == 0).all()
+    assert (observations[5]["rgb"][:, 14:] == 0).all()
     assert (observations[5]["rgb"] == 255).mean() > (observations[3]["rgb"] == 255).mean()
 
     # The inner one fails first: salt on black can be seen, black on salt cannot.
     inner_black, inner_salt = nested("black", "salt_and_pepper")[0], nested("salt_and_pepper", "black")[0]
-    assert inner_black[5]["rgb"][14:].any() and not inner_salt[5]["rgb"].any()
+    assert inner_black[5]["rgb"][:, 14:].any() and not inner_salt[5]["rgb"].any()
 
 
 def test_two_failures_of_one_kind_need_names() -> None:

@@ -53,25 +53,34 @@ class Failure:
 
 
 def lose(image: Array, rng: Rng, share: float, blank: int) -> Array:
-    """The readout stops early: the last rows are missing. ``share`` of the rows, which read ``blank`` instead."""
+    """
+    A bank of columns is no longer read: the last ``share`` of them is ``blank``. Columns, because in most scenes the
+    rows of the sky would not be missed.
+    """
     lost = image.copy()
-    lost[_first_lost(len(image), share) :] = blank
+    lost[:, _first_lost(image.shape[1], share) :] = blank
     return lost
 
 
+def hold(image: Array, rng: Rng, past: Array, share: float) -> Array:
+    """A bank of columns is no longer read: the last ``share`` of them keeps what it showed in ``past``."""
+    held = image.copy()
+    first = _first_lost(image.shape[1], share)
+    held[:, first:] = past[:, first:]
+    return held
+
+
 def lose_entries(vector: Array, rng: Rng, low: Array, high: Array, share: float) -> Array:
-    """The last entries of a vector read zero, or the bound nearest to it. ``share`` of the entries."""
+    """The last ``share`` of the entries of a vector reads zero, or the bound nearest to it."""
     lost = vector.copy()
     lost[_first_lost(len(vector), share) :] = 0
     return np.clip(lost, low, high)
 
 
-def hold(image: Array, rng: Rng, past: Array, share: float) -> Array:
-    """The readout stops early, and the last rows keep what they showed in ``past``. ``share`` of the rows."""
-    held = image.copy()
-    first = _first_lost(len(image), share)
-    held[first:] = past[first:]
-    return held
+def hold_entries(vector: Array, rng: Rng, past: Array, share: float) -> Array:
+    """The last ``share`` of the entries of a vector keeps what it showed in ``past``."""
+    first = _first_lost(len(vector), share)
+    return np.concatenate((vector[:first], past[first:]))
 
 
 def delay(image: Array, rng: Rng, past: Array, steps: float) -> Array:
@@ -217,8 +226,8 @@ _ASKEW: Final = (0.03, 0.06, 0.12)
 #: Every failure: kind -> sensor -> function and parameters at severities 1, 2, 3. A sensor that is missing does not
 #: know the kind: an event camera, for one, has no exposure and no motion blur. What the parameters mean:
 #:
-#: - ``share``: of the rows (black, frozen), pixels (salt_and_pepper, dead_pixels), patches (depth_dropout) or entries
-#:   of a vector that fail; ``blank``, ``dark``, ``bright``: the codes they read; ``void``: a code that is spared
+#: - ``share``: of the columns (black, frozen), pixels (salt_and_pepper, dead_pixels), patches (depth_dropout) or
+#:   entries of a vector that fail; ``blank``, ``dark``, ``bright``: what they read; ``void``: a code that is spared
 #: - ``sigma``: standard deviation of noise: rgb and depth in codes, vectors in widths of their range
 #: - ``rate``: additional events per pixel and bin
 #: - ``stops``: powers of two of light
@@ -231,11 +240,16 @@ FAILURES: Final[Mapping[str, Mapping[str, Failure]]] = {
         "depth": Failure(lose, share=_THIRDS, blank=0),  # no return
         "vector": Failure(lose_entries, share=_THIRDS),
     },
-    "frozen": {sensor: Failure(hold, share=_THIRDS) for sensor in SENSORS},
+    "frozen": {
+        "rgb": Failure(hold, share=_THIRDS),
+        "event": Failure(hold, share=_THIRDS),
+        "depth": Failure(hold, share=_THIRDS),
+        "vector": Failure(hold_entries, share=_THIRDS),
+    },
     "noise": {
         "rgb": Failure(gaussian_noise, sigma=(15.0, 30.0, 60.0)),
         "event": Failure(spurious_events, rate=(0.05, 0.2, 0.8)),
-        "depth": Failure(depth_noise, sigma=(2.0, 5.0, 12.0)),
+        "depth": Failure(depth_noise, sigma=(3.0, 8.0, 20.0)),
         "vector": Failure(vector_noise, sigma=(0.05, 0.1, 0.2)),
     },
     "salt_and_pepper": {

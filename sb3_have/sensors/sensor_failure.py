@@ -62,7 +62,8 @@ class SensorFailure(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
     :param modality: Key of the observation that fails; None for a Box observation.
     :param kind: A key of :data:`~sb3_have.sensors.failures.FAILURES` that the sensor knows
         (:func:`~sb3_have.sensors.failures.failures_for`).
-    :param severity: 1, 2 or 3. "black" and "frozen" take a third, two thirds and all of the image.
+    :param severity: 1, 2 or 3. "black" and "frozen" take a third, two thirds and all of the image; a sensor
+        that is gone altogether is severity 3.
     :param probability: Share of the steps or episodes that fail, 0..1.
     :param schedule: ``(start, stop)``: the steps from start to before stop, or to the end with stop None; a list of
         such pairs; or a function of the step that says whether it fails (a module's own, not a lambda, if the
