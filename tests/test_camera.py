@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from sb3_have.envs.camera import FAR, SUPERSAMPLING, Camera, Objects
+from sb3_have.envs.road_shape import RoadShape
 from sb3_have.envs.scene import ASPHALT, DASH_LENGTH, DASH_PERIOD, LINE_WIDTH, PAINTS, VEHICLE_HEIGHT, WORLD_PERIOD
 from sb3_have.envs.weather import LUMA
 
@@ -16,7 +17,7 @@ FOCAL = SIZE / 2 / np.tan(np.radians(30))
 
 
 def road_camera(size: int = SIZE) -> Camera:
-    return Camera(size, lanes_count=4, lane_width=4.0)
+    return Camera(size, RoadShape(lanes_count=4))
 
 
 def poses(*vehicles: tuple[float, float, float]) -> Array:
@@ -203,7 +204,8 @@ def test_the_verge_does_not_jump(period: int) -> None:
 
 def test_the_verge_has_no_double_patch_at_zero() -> None:
     camera = road_camera(65)
-    camera._patchwork = np.tile(np.arange(64, dtype=np.float32), (64, 1))  # the number of the patch across the road
+    # The number of the patch across the road.
+    camera.ground_view.patchwork = np.tile(np.arange(64, dtype=np.float32), (64, 1))
     # The middle column looks along the road: it sees the ground at the ego's own y.
     patches = [camera.ground(poses((0, y, 0))).verge[0, -1, 32] for y in (-1.5, -0.5, 0.5, 1.5)]
     np.testing.assert_array_equal(patches, [62, 63, 0, 1])

@@ -1,9 +1,9 @@
 """A pinhole camera on the roof of a car: from poses to what every pixel sees.
 
 Objects are painted face by face, far to near, with OpenCV at twice the resolution. The plane equation of the painted
-face then gives each sample its exact depth and place on the face, and the face's texture its material. The flat ground
-needs no painting: every pixel's share of marking, road and verge is known in closed form, box-filtered over the pixel's
-footprint. Several instants are rendered in one pass, because at these image sizes the cost is numpy calls, not pixels.
+face then gives each sample its exact depth and place on the face, and the face's texture its material. The ground needs
+no painting, see :mod:`sb3_have.envs.ground`. Several instants are rendered in one pass, because at these image sizes
+the cost is numpy calls, not pixels.
 
 Camera frame: forward, right, metres. Image: u to the right, v down, in pixels; the first pixel's centre is (0.5, 0.5).
 """
@@ -17,11 +17,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_have.envs.ground import Ground, GroundView
+from sb3_have.envs.road_shape import RoadShape
 from sb3_have.envs.scene import (
     BODY,
-    DASH_LENGTH,
-    DASH_PERIOD,
-    LINE_WIDTH,
+    FRONT,
+    FRONT_LIT,
     TEXTURE_COLUMNS,
     TEXTURE_ROWS,
     TEXTURES,
@@ -38,19 +39,6 @@ NEAR: Final = 0.5
 FAR: Final = 200.0
 #: Samples per pixel and direction.
 SUPERSAMPLING: Final = 2
-
-
-@dataclass
-class Ground:
-    """What each pixel under the horizon sees, float32 (instants, rows, columns)."""
-
-    road: Array  # share of the paved road; the rest is verge
-    marking: Array  # share of the road that is painted; the rest is asphalt
-    verge: Array  # brightness factor of the verge's patchwork
-
-    def last(self) -> Ground:
-        """The last instant alone."""
-        return Ground(self.road[-1:], self.marking[-1:], self.verge[-1:])
 
 
 @dataclass
@@ -77,19 +65,19 @@ class Camera:
     Pinhole camera 1 m ahead of the ego's centre and 1.5 m above the road, looking along its heading.
 
     :param image_size: Rows and columns.
-    :param lanes_count: Lanes of the road; the centre of lane k lies at y = k * lane_width.
-    :param lane_width: In metres.
+    :param shape: Of the road.
     :param field_of_view: Horizontal and vertical angle in degrees.
     """
 
     offset = 1.0
     height = 1.5
 
-    def __init__(self, image_size: int, lanes_count: int, lane_width: float, field_of_view: float = 60.0) -> None:
+    def __init__(self, image_size: int, shape: RoadShape, field_of_view: float = 60.0) -> None:
         self.size = image_size
-        self.lanes_count = lanes_count
-        self.lane_width = lane_width
-        self.roadside = Roadside(lanes_count, lane_width)
+        self.shape = shape
+        self.roadside = Roadside(shape)
+        # Nobody sees the front of a car that goes the same way.
+        self._front = FRONT_LIT if shape.oncoming else FRONT
         self.focal = float(0.5 * image_size / np.tan(np.radians(field_of_view / 2)))
         self.centre = 0.5 * image_size
         #: First image row that looks at the ground. In an odd number of rows the middle one looks at infinity.
@@ -101,8 +89,7 @@ class Camera:
         #: Distance of the ground in each row from the horizon down, (rows, 1), and its offset to the right.
         self.ground_forward = np.float32(self.height) / self.slope[self.horizon :, None]
         self.ground_right = self.ground_forward * self.slope
-        # The verge is a patchwork of random brightness, the same in every episode.
-        self._patchwork = np.random.default_rng(0).uniform(0.55, 1.45, (64, 64)).astype(np.float32)
+        self.ground_view = GroundView(shape, self.ground_forward, self.ground_right, self.focal, self.height)
 
     def ground(self, poses: Array) -> Ground:
         """
@@ -111,31 +98,7 @@ class Camera:
         :param poses: (instants, 1 + vehicles, 3): x, y, heading; row 0 is the ego.
         """
         x, y, heading = (value.astype(np.float32)[:, None, None] for value in self._pose(poses, WORLD_PERIOD))
-        sin, cos = np.sin(heading), np.cos(heading)
-        along = x + cos * self.ground_forward - sin * self.ground_right
-        across = y + sin * self.ground_forward + cos * self.ground_right
-        # Size of a pixel on the ground.
-        wide = self.ground_forward / np.float32(self.focal)
-        long = np.minimum(wide * self.ground_forward / np.float32(self.height), np.float32(FAR))
-
-        lane = across / np.float32(self.lane_width) + np.float32(0.5)
-        line = np.clip(np.rint(lane), 0, self.lanes_count)
-        distance = np.abs(lane - line) * np.float32(self.lane_width)
-        marking = np.maximum((LINE_WIDTH / 2 + wide / 2 - distance) / wide, 0)
-        marking = np.minimum(marking, np.minimum(1, LINE_WIDTH / wide))
-        # Lines between lanes are dashed: less paint, by the share of the pixel's length that dashes cover.
-        dashed = np.flatnonzero((marking != 0) & (line > 0) & (line < self.lanes_count))
-        middle, length = along.take(dashed), long[dashed // self.size % len(long), 0]
-        paint = _painted_length(middle + length / 2) - _painted_length(middle - length / 2)
-        marking.reshape(-1)[dashed] *= paint / length
-
-        beyond = np.abs(across - np.float32(self.roadside.middle)) - np.float32(self.roadside.half_width)
-        road = np.clip(np.float32(0.5) - beyond / wide, 0, 1)
-        # Patches of 1 m average out where they are smaller than a pixel.
-        patch = (np.floor(along).astype(np.int32) & 63) * 64 + (np.floor(across).astype(np.int32) & 63)
-        patches = self._patchwork.take(patch)
-        verge = 1 + (patches - 1) * np.minimum(1, 2 / np.maximum(wide, long))
-        return Ground(road, marking, verge)
+        return self.ground_view.look(x, y, heading)
 
     def objects(self, poses: Array, sizes: Array) -> Objects:
         """
@@ -194,7 +157,7 @@ class Camera:
         in_view = (forward > -5) & (forward < FAR + 5) & (np.abs(right) < 0.6 * forward + 12)
         shown = np.flatnonzero(in_view.any(axis=0))
         order = shown[np.argsort(-np.hypot(forward[:, shown], right[:, shown]), axis=1, kind="stable")]
-        faces = Faces.concatenate(self.roadside.faces(x, FAR), vehicle_faces(traffic, sizes[1:], order))
+        faces = Faces.concatenate(self.roadside.faces(x, FAR), vehicle_faces(traffic, sizes[1:], order, self._front))
 
         start, end = _to_camera(faces.start, x, y, heading), _to_camera(faces.end, x, y, heading)
         # Turned towards the camera: the start lies to the left of the end.
@@ -203,9 +166,16 @@ class Camera:
         # A vehicle is shown at the instants at which it is in view; number -1, the roadside, at all.
         every = np.arange(len(poses))[:, None]
         seen &= np.concatenate((in_view, every >= 0), axis=1)[every, faces.vehicle]
-        instant = np.nonzero(seen)[0]
-        start, end = start[seen], end[seen]
-        faces = Faces(*(getattr(faces, field.name)[seen] for field in fields(Faces)))
+        instant, face = np.nonzero(seen)
+        if not self.shape.plain:
+            # A road that bends or forks has its roadside before vehicles as well as behind them.
+            away = np.maximum(np.hypot(*start[instant, face].T), np.hypot(*end[instant, face].T))
+            vehicle = faces.vehicle[instant, face]
+            away = np.where(vehicle < 0, away, np.hypot(forward, right)[instant, vehicle])
+            order = np.lexsort((-away, instant))
+            instant, face = instant[order], face[order]
+        start, end = start[instant, face], end[instant, face]
+        faces = Faces(*(getattr(faces, field.name)[instant, face] for field in fields(Faces)))
         start, s_start = _clip_near(start, end, faces.s_start, faces.s_end)
         end, s_end = _clip_near(end, start, faces.s_end, s_start)
 
@@ -264,10 +234,3 @@ def _clip_near(point: Array, other: Array, s: Array, s_other: Array) -> tuple[Ar
     behind = point[:, 0] < NEAR
     share = np.where(behind, (NEAR - point[:, 0]) / np.where(behind, other[:, 0] - point[:, 0], 1), 0)
     return point + share[:, None] * (other - point), s + share * (s_other - s)
-
-
-def _painted_length(x: Array) -> Array:
-    """Metres of paint on a dashed line between 0 and x."""
-    period = np.floor(x / np.float32(DASH_PERIOD))
-    painted: Array = period * DASH_LENGTH + np.minimum(x - period * np.float32(DASH_PERIOD), DASH_LENGTH)
-    return painted

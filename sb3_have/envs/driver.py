@@ -1,4 +1,4 @@
-"""highway-env's IDM/MOBIL driver on a :class:`~sb3_have.envs.road.HighwayNetwork`, bit for bit, in half the time.
+"""highway-env's IDM/MOBIL driver on a :class:`~sb3_have.envs.road.HighwayRoad`, bit for bit, in half the time.
 
 A driver decides with a few dozen operations on single numbers, on which numpy is slow. Here they are Python's, which
 round alike, except for the functions beyond plain arithmetic: numpy's may differ from the C library's in the last bit.
@@ -20,7 +20,7 @@ from highway_env.vehicle.kinematics import Vehicle
 
 
 class Driver(IDMVehicle):
-    """An ``IDMVehicle`` that knows its road to be straight, along +x and longer than any drive."""
+    """An ``IDMVehicle`` that knows its road to lead along x and to be longer than any drive."""
 
     def act(self, action: Any = None) -> None:
         if self.crashed:
@@ -37,10 +37,13 @@ class Driver(IDMVehicle):
         }
 
     def steering_control(self, target_lane_index: LaneIndex) -> float:
-        lateral = float(self.position[1] - self.road.network.get_lane(target_lane_index).start[1])
+        lane = self.road.network.get_lane(target_lane_index)
+        along, lateral = lane.local_coordinates(self.position)
+        road_heading = lane.heading_at(along + float(self.speed) * self.TAU_PURSUIT)
         speed, heading = not_zero(float(self.speed)), float(self.heading)
         wanted_heading = float(np.arcsin(_clip(-self.KP_LATERAL * lateral / speed, -1, 1)))
-        turn = self.KP_HEADING * wrap_to_pi(_clip(wanted_heading, -math.pi / 4, math.pi / 4) - heading)
+        wanted_heading = road_heading + _clip(wanted_heading, -math.pi / 4, math.pi / 4)
+        turn = self.KP_HEADING * wrap_to_pi(wanted_heading - heading)
         slip_angle = np.arcsin(_clip(self.LENGTH / 2 / speed * turn, -1, 1))
         steering = float(np.arctan(2 * np.tan(slip_angle)))
         return _clip(steering, -self.MAX_STEERING_ANGLE, self.MAX_STEERING_ANGLE)
@@ -54,7 +57,7 @@ class Driver(IDMVehicle):
         speed_ratio = max(ego_vehicle.speed, 0) / abs(not_zero(target_speed))
         acceleration = self.COMFORT_ACC_MAX * (1 - float(np.power(speed_ratio, self.DELTA)))
         if front_vehicle is not None:
-            distance = float(front_vehicle.position[0] - ego_vehicle.position[0])
+            distance = ego_vehicle.lane.sign * float(front_vehicle.position[0] - ego_vehicle.position[0])
             gap_ratio = self.desired_gap(ego_vehicle, front_vehicle) / not_zero(distance)
             acceleration -= self.COMFORT_ACC_MAX * float(np.power(gap_ratio, 2))
         return float(acceleration)
@@ -66,6 +69,21 @@ class Driver(IDMVehicle):
         approach = float(np.dot(speed * direction - front_vehicle.velocity, direction))
         braking = 2 * math.sqrt(-self.COMFORT_ACC_MAX * self.COMFORT_ACC_MIN)
         return float(self.DISTANCE_WANTED + speed * self.TIME_WANTED + speed * approach / braking)
+
+
+class NeverReverses(Vehicle):
+    """A vehicle that brakes to a halt and no further; highway-env's own goes on backwards."""
+
+    MIN_SPEED = 0.0
+    speed: float
+
+    def step(self, dt: float) -> None:
+        super().step(dt)
+        self.speed = float(np.clip(self.speed, self.MIN_SPEED, self.MAX_SPEED))
+
+
+class ScenarioDriver(NeverReverses, Driver):
+    """The driver of all roads but the straight highway: it meets cars head-on, or the end of its lane."""
 
 
 def _clip(value: float, low: float, high: float) -> float:

@@ -1,4 +1,4 @@
-"""HighwayVision-v0: drive along a busy highway, seen through an RGB camera, an event camera and a depth camera."""
+"""HighwayVision-v0: drive along a busy road, seen through an RGB camera, an event camera and a depth camera."""
 
 from __future__ import annotations
 
@@ -11,10 +11,12 @@ from gymnasium import spaces
 from highway_env.envs.common.abstract import AbstractEnv
 from highway_env.envs.common.action import ContinuousAction
 from highway_env.envs.common.observation import ObservationType
-from highway_env.vehicle.kinematics import Vehicle
 
 from sb3_have.envs import traffic
+from sb3_have.envs.driver import NeverReverses
+from sb3_have.envs.lanes import FORWARD, ShapedNetwork
 from sb3_have.envs.road import LANE_WIDTH, SPEED_LIMIT, HighwayNetwork, HighwayRoad
+from sb3_have.envs.road_shape import PERIOD, road_shape
 from sb3_have.envs.vision import VisionSensors, compose
 from sb3_have.envs.weather import WEATHERS
 
@@ -22,15 +24,8 @@ START_X = 1000.0
 """Where the ego vehicle starts along the road [m]: far from the road's own ends."""
 
 
-class EgoVehicle(Vehicle):
-    """highway-env's vehicle, whose speed never leaves its range (the stock one drifts backwards after braking)."""
-
-    MIN_SPEED = 0.0
-    speed: float
-
-    def step(self, dt: float) -> None:
-        super().step(dt)
-        self.speed = float(np.clip(self.speed, self.MIN_SPEED, self.MAX_SPEED))
+class EgoVehicle(NeverReverses):
+    """The car that the actions drive."""
 
 
 class VisionObservation(ObservationType):
@@ -45,7 +40,7 @@ class VisionObservation(ObservationType):
 
 
 class HighwayVisionEnv(AbstractEnv):
-    """A straight highway with traffic, continuous throttle and steering, and images for observations.
+    """A road with traffic, continuous throttle and steering, and images for observations.
 
     Observation: a Dict of uint8 images (H, W, C), 0 to 255: ``rgb`` (C=3), ``event`` (C=5 temporal bins of signed
     event counts, stored as 128 + count), ``depth`` (C=1, logarithmic). Action: ``Box(-1, 1, (2,))`` =
@@ -53,13 +48,26 @@ class HighwayVisionEnv(AbstractEnv):
 
         v_s / max_speed - steer_cost * |steer| - brake_cost * max(0, -throttle) - crash_penalty * (crashed or off road)
 
-    with v_s the mean speed along the road during the step [m/s]. A crash or leaving the road terminates the episode,
-    ``max_episode_steps`` truncates it. ``info`` after reset and every step: ``distance`` (sum of v_s dt so far [m]),
+    with v_s the mean speed along the road during the step [m/s], the motion projected on its direction. A crash or
+    leaving the road terminates the episode, ``max_episode_steps`` truncates it. ``info`` after reset and every step: ``distance`` (sum of v_s dt so far [m]),
     ``speed`` [m/s], ``crashed``, ``offroad``, ``weather``, ``end_reason`` ("crash", "offroad", "timeout" or None).
 
     The traffic is highway-env's IDM/MOBIL drivers in a window that moves along (:mod:`sb3_have.envs.traffic`). The
     same seed gives the same bits; traffic and sensors draw from separate streams, so that episodes with the same seed
     meet the same traffic in any weather and with any set of modalities.
+
+    Scenarios:
+
+    - "highway": straight, all lanes in one direction;
+    - "merge": the same with an on-ramp from the right every 480 m. Its slow traffic speeds up on an acceleration lane
+      of 180 m and cuts in where MOBIL holds it to be safe, less and less choosy towards the end. The ego vehicle may
+      drive there, too, while the lane lasts;
+    - "curves": a winding road, a sine of 12 m and period 480 m (radius 486 m and more: two thirds of the default
+      ``steering_range`` at most), half of its lanes for oncoming traffic behind a double solid line. Driving there is
+      possible and counts as road, but its traffic is bound to come; it brakes for who comes head-on, and never changes
+      sides itself.
+
+    In the latter two the ego vehicle starts at a random place of the period.
 
     :param weather: one of :data:`sb3_have.envs.weather.WEATHERS`, a list to draw from each episode, or "random" for
         any of the eight; ``reset(options={"weather": ...})`` takes the same and holds for that episode only
@@ -68,7 +76,7 @@ class HighwayVisionEnv(AbstractEnv):
     :param vehicles_count: other vehicles in the window of 440 m
     :param traffic_speed: range of the speeds the others want to drive at [m/s]; by default as in highway-env, 70 to
         80% of its limit of 30 m/s
-    :param lanes_count: number of lanes
+    :param lanes_count: number of lanes in all, not counting ramps; even in "curves"
     :param max_episode_steps: control steps per episode, or None for no limit
     :param initial_speed: of the ego vehicle [m/s], in 0 to ``max_speed``
     :param simulation_frequency: [Hz], a multiple of ``policy_frequency``
@@ -81,6 +89,7 @@ class HighwayVisionEnv(AbstractEnv):
     :param event: settings of the event camera, see :class:`sb3_have.envs.vision.VisionSensors`
     :param depth: settings of the depth camera, see :class:`sb3_have.envs.vision.VisionSensors`
     :param render_mode: None or "rgb_array" (RGB | event | depth side by side)
+    :param scenario: "highway", "merge" or "curves", see above
     :raises ValueError: for any option outside of what is stated here
     """
 
@@ -107,6 +116,7 @@ class HighwayVisionEnv(AbstractEnv):
         event: Mapping[str, Any] | None = None,
         depth: Mapping[str, Any] | None = None,
         render_mode: str | None = None,
+        scenario: str = "highway",
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
@@ -135,6 +145,8 @@ class HighwayVisionEnv(AbstractEnv):
             if not (np.isfinite(weight) and weight >= 0):
                 raise ValueError(f"{name} must be >= 0 (it is subtracted from the reward), got {weight!r}")
 
+        self.shape = road_shape(scenario, int(lanes_count), LANE_WIDTH)
+        self.scenario = scenario
         self.weathers = _weather_choices(weather)
         self.vehicles_count, self.lanes_count = int(vehicles_count), int(lanes_count)
         self.traffic_speed = (float(traffic_speed[0]), float(traffic_speed[1]))
@@ -152,6 +164,7 @@ class HighwayVisionEnv(AbstractEnv):
             lane_width=LANE_WIDTH,
             event=None if event is None else dict(event),
             depth=None if depth is None else dict(depth),
+            scenario=scenario,
         )
         self._fixed_action_space = spaces.Box(-1.0, 1.0, shape=(2,), dtype=np.float32)
         frequencies = {"simulation_frequency": simulation_frequency, "policy_frequency": policy_frequency}
@@ -216,9 +229,12 @@ class HighwayVisionEnv(AbstractEnv):
     def _reset(self) -> None:
         self._sensor_rng = np.random.default_rng(self.np_random.integers(2**63))
         self.weather = self._choices[self._sensor_rng.integers(len(self._choices))]
-        self.road = HighwayRoad(HighwayNetwork(self.lanes_count), np_random=self.np_random)
-        lane = int(self.np_random.integers(self.lanes_count))
-        ego = EgoVehicle.make_on_lane(self.road, ("0", "1", lane), START_X, self.initial_speed)
+        plain = self.shape.plain
+        network = HighwayNetwork(self.lanes_count) if plain else ShapedNetwork(self.shape)
+        self.road = HighwayRoad(network, np_random=self.np_random)
+        lane = int(self.np_random.integers(self.lanes_count - self.shape.oncoming))
+        x = START_X if plain else START_X + self.np_random.uniform(0, PERIOD)
+        ego = EgoVehicle.make_on_lane(self.road, (*FORWARD, lane), x, self.initial_speed)
         self.road.vehicles.append(ego)
         self.vehicle = ego
         traffic.populate(self.road, ego, self.vehicles_count, self.traffic_speed, self.np_random)
@@ -243,9 +259,11 @@ class HighwayVisionEnv(AbstractEnv):
         return super().step(np.clip(action, -1.0, 1.0))  # type: ignore[no-any-return]
 
     def _simulate(self, action: np.ndarray | None = None) -> None:
-        x = self.vehicle.position[0]
+        before = self.vehicle.position.copy()
         super()._simulate(action)
-        self._progress = float(self.vehicle.position[0] - x)
+        dx, dy = (self.vehicle.position - before).tolist()
+        ahead, aside = self.shape.direction(float(before[0]) + 0.5 * dx)
+        self._progress = dx * ahead + dy * aside
         self._distance += self._progress
 
     def _reward(self, action: np.ndarray) -> float:

@@ -1,8 +1,9 @@
-"""A straight highway that computes what :mod:`highway_env` computes, bit for bit, in less time.
+"""A highway that computes what :mod:`highway_env` computes, bit for bit, in less time.
 
 Every vehicle looks for its neighbours several times per simulation step and every pair of vehicles is checked for a
-collision. On a straight road along x both are answered from plain floats. Only public methods are overridden;
-``benchmarks/road_identity.py`` drives this road and the stock one side by side.
+collision. On a road that leads along x both are answered from plain floats. Only public methods are overridden;
+``benchmarks/road_identity.py`` drives this road and the stock one side by side. Lanes that are not straight are in
+:mod:`sb3_have.envs.lanes`.
 """
 
 from __future__ import annotations
@@ -28,8 +29,23 @@ SPEED_LIMIT = 30.0
 class AxisLane(StraightLane):
     """A straight lane along +x: its coordinates are differences, no dot product is needed."""
 
+    sign = 1.0
+    """+1 where it is driven towards +x, -1 where towards -x."""
+
     def local_coordinates(self, position: np.ndarray) -> tuple[float, float]:
         return float(position[0] - self.start[0]), float(position[1] - self.start[1])
+
+    def heading_at(self, longitudinal: float) -> float:
+        return 0.0
+
+    def occupants(self, placed: list[tuple[float, float, Vehicle]]) -> list[tuple[float, Vehicle]]:
+        """
+        Who is on the lane or straddles its border, and how far along.
+
+        :param placed: x [m], y [m] and vehicle
+        """
+        centre = float(self.start[1])
+        return [(x, vehicle) for x, y, vehicle in placed if abs(y - centre) <= LANE_WIDTH / 2 + 1]
 
 
 class HighwayNetwork(RoadNetwork):
@@ -56,7 +72,7 @@ class HighwayNetwork(RoadNetwork):
 
 
 class HighwayRoad(Road):
-    """A :class:`~highway_env.road.road.Road` on a :class:`HighwayNetwork`, with cheap neighbours and collisions."""
+    """A :class:`~highway_env.road.road.Road` on lanes that lead along x, with cheap neighbours and collisions."""
 
     _placed: list[tuple[float, float, Vehicle]] | None = None
     _on_lane: dict[LaneIndex, list[tuple[float, Vehicle]]]
@@ -76,10 +92,10 @@ class HighwayRoad(Road):
         if self._placed is None:
             return super().neighbour_vehicles(vehicle, lane_index)  # type: ignore[no-any-return]
         lane_index = lane_index or vehicle.lane_index
+        lane = self.network.get_lane(lane_index)
         if lane_index not in self._on_lane:
-            centre = lane_index[2] * LANE_WIDTH
-            self._on_lane[lane_index] = [(x, v) for x, y, v in self._placed if abs(y - centre) <= LANE_WIDTH / 2 + 1]
-        x = float(vehicle.position[0])
+            self._on_lane[lane_index] = lane.occupants(self._placed)
+        x = lane.sign * float(vehicle.position[0])
         x_front, x_rear = math.inf, -math.inf
         front = rear = None
         for x_other, other in self._on_lane[lane_index]:

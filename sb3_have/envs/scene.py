@@ -1,4 +1,4 @@
-"""What stands on and along the road, in world coordinates: x forward along the road, y to the right, z up, metres.
+"""What stands on and along the road, in world coordinates: x forward, y to the right, z up, metres.
 
 Everything that rises from the ground is a vertical rectangle (a fir is a triangle) with a small texture of materials.
 """
@@ -11,11 +11,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_have.envs.road_shape import PERIOD, RoadShape
+
 Array = NDArray[np.floating]
 IntArray = NDArray[np.integer]
 
 # Materials: rows of the albedo table. Vehicle n has material BODY + n.
-GLASS, RUBBER, LAMP, STEEL, JOINT, LEAVES, LEAVES_DARK, BODY = range(8)
+GLASS, RUBBER, LAMP, STEEL, JOINT, LEAVES, LEAVES_DARK, HEADLAMP, BODY = range(9)
 #: Albedo (red, green, blue) of the materials below BODY.
 ALBEDO: Final = np.array(
     [
@@ -26,6 +28,7 @@ ALBEDO: Final = np.array(
         (0.10, 0.10, 0.10),
         (0.05, 0.10, 0.03),
         (0.03, 0.06, 0.02),
+        (0.60, 0.60, 0.60),
     ],
     dtype=np.float32,
 )
@@ -52,12 +55,19 @@ SHOULDER_WIDTH: Final = 2.0
 LINE_WIDTH: Final = 0.2
 DASH_LENGTH: Final = 3.0
 DASH_PERIOD: Final = 12.0
+#: Beside a ramp the road's edge is dashed more densely.
+RAMP_DASH_PERIOD: Final = 6.0
+#: Two solid lines part the directions, their middles so far to either side of the centre.
+CENTRE_LINES: Final = 0.2
 #: The roadside repeats itself with this period, and positions are taken modulo it: single precision holds on any road.
-#: A multiple of all that repeats on its own: dashes (12 m), trees (20 m), joints (4 m) and the verge (64 m).
-WORLD_PERIOD: Final = 960.0
+#: A multiple of all that repeats on its own: the road's shape, dashes (12 m), trees (20 m), joints (4 m) and the verge
+#: (64 m).
+WORLD_PERIOD: Final = 2 * PERIOD
 RAIL_BOTTOM: Final = 0.45
 RAIL_TOP: Final = 0.8
 RAIL_JOINTS: Final = 4.0
+#: Where a guard-rail is not straight it is drawn in pieces of this length, a whole number of joints.
+RAIL_PIECE: Final = 20.0
 TREE_HEIGHT: Final = 7.0
 TREE_HALF_WIDTH: Final = 1.6
 TREE_SPACING: Final = 20.0
@@ -70,12 +80,13 @@ TEXTURE_ROWS, TEXTURE_COLUMNS = 10, 20
 def _texture(*rows: str) -> NDArray[np.int64]:
     """A face drawn in letters, top row first; stored bottom row first."""
     letters = {"g": GLASS, "k": RUBBER, "l": LAMP, "s": STEEL, "j": JOINT, "t": LEAVES, "d": LEAVES_DARK, "b": BODY}
+    letters["h"] = HEADLAMP
     drawn = np.array([[letters[letter] for letter in row] for row in rows[::-1]])
     return drawn.repeat(TEXTURE_ROWS // len(drawn), axis=0).repeat(TEXTURE_COLUMNS // len(drawn[0]), axis=1)
 
 
 # Kinds of faces: rows of the table of textures.
-REAR, FRONT, SIDE, RAIL, TREE = range(5)
+REAR, FRONT, SIDE, RAIL, TREE, FRONT_LIT = range(6)
 TEXTURES: Final = np.stack(
     [
         _texture(
@@ -94,6 +105,18 @@ TEXTURES: Final = np.stack(
         _texture("bbbbbbbbbb", "bggggbgggb", "bbbbbbbbbb", "bkkbbbbkkb", "kkkkkkkkkk"),
         _texture("sssssssssj"),
         _texture("tdtdt", "dttdt"),
+        _texture(
+            "bbbbbbbbbb",
+            "bggggggggb",
+            "bggggggggb",
+            "bggggggggb",
+            "bbbbbbbbbb",
+            "hhbbbbbbhh",
+            "hhbkkkkbhh",
+            "bbbkkkkbbb",
+            "kkkkkkkkkk",
+            "kkkkkkkkkk",
+        ),
     ]
 )
 
@@ -122,58 +145,111 @@ class Roadside:
     """
     Guard-rails and firs along a road, the same in every episode.
 
-    :param lanes_count: Lanes of the road; the centre of lane k lies at y = k * lane_width.
-    :param lane_width: In metres.
+    :param shape: Of the road.
     """
 
-    def __init__(self, lanes_count: int, lane_width: float) -> None:
-        self.middle = 0.5 * (lanes_count - 1) * lane_width
+    def __init__(self, shape: RoadShape) -> None:
+        self.shape = shape
+        self.middle = 0.5 * (shape.lanes_count - 1) * shape.lane_width
         #: Half the width of the paved road with its shoulders.
-        self.half_width = 0.5 * lanes_count * lane_width + SHOULDER_WIDTH
-        shape = (int(WORLD_PERIOD / TREE_SPACING), 2, 2)
-        self._jitter = np.random.default_rng(0).uniform(-1, 1, shape) * (4.0, 2.5)
+        self.half_width = 0.5 * shape.lanes_count * shape.lane_width + SHOULDER_WIDTH
+        jitter = (int(WORLD_PERIOD / TREE_SPACING), 2, 2)
+        self._jitter = np.random.default_rng(0).uniform(-1, 1, jitter) * (4.0, 2.5)
 
     def faces(self, x: Array, sight: float) -> Faces:
         """
-        What can be seen from each x, far to near.
+        What can be seen from each x; far to near on a plain road.
 
         :param x: Positions along the road, (instants,).
         :param sight: Distance at which the guard-rails end.
         """
+        return Faces.concatenate(self._trees(x), self._rail(x, sight) if self.shape.plain else self._pieces(x, sight))
+
+    def _trees(self, x: Array) -> Faces:
         # Every instant has the faces around its own x, so that it looks the same whichever others are rendered with it.
         number = (x[:, None] // TREE_SPACING).astype(np.int64) + np.arange(int(TREE_RANGE / TREE_SPACING), -1, -1)
         tree = self._jitter[number % len(self._jitter)]
         tree[..., 0] += TREE_SPACING * number[..., None]
         tree[..., 1] += self.middle + np.array((-1, 1)) * (self.half_width + 5)
+        if not self.shape.plain:
+            tree[..., 1] += self.shape.bend(tree[..., 0])
+            tree[:, :, 1, 1] += self._widening(tree[:, :, 1, 0])
         tree = tree.reshape(len(x), -1, 2)
-        to_end = np.array((0.0, TREE_HALF_WIDTH))
+        to_end, one = np.array((0.0, TREE_HALF_WIDTH)), np.ones(tree.shape[:2])
+        return Faces(
+            start=tree - to_end,
+            end=tree + to_end,
+            normal=one[..., None] * (-1.0, 0.0),
+            s_start=0 * one,
+            s_end=one,
+            bottom=0 * one,
+            top=TREE_HEIGHT * one,
+            kind=np.full(one.shape, TREE),
+            vehicle=np.full(one.shape, -1),
+        )
 
+    def _rail(self, x: Array, sight: float) -> Faces:
+        """The left and the right rail of a plain road, in one piece each."""
         near, far = x - 5, x + sight
-        rail_y = np.tile(self.middle + np.array((-1, 1)) * (self.half_width + 0.5), (len(x), 1))  # left, right
+        y = np.tile(self.middle + np.array((-1, 1)) * (self.half_width + 0.5), (len(x), 1))
         s_near = near % RAIL_JOINTS / RAIL_JOINTS
         s_far = s_near + (far - near) / RAIL_JOINTS
-        trees, rails = np.ones(tree.shape[:2]), np.ones((len(x), 2))
-        parts = (
-            (tree - to_end, np.stack((np.stack((near, far), axis=1), rail_y), axis=-1)),
-            (tree + to_end, np.stack((np.stack((far, near), axis=1), rail_y), axis=-1)),
-            (trees[..., None] * (-1.0, 0.0), rails[..., None] * [(0.0, 1.0), (0.0, -1.0)]),
-            (0 * trees, np.stack((s_near, s_far), axis=1)),
-            (trees, np.stack((s_far, s_near), axis=1)),
-            (0 * trees, RAIL_BOTTOM * rails),
-            (TREE_HEIGHT * trees, RAIL_TOP * rails),
-            (np.full(trees.shape, TREE), np.full(rails.shape, RAIL)),
-            (np.full(trees.shape, -1), np.full(rails.shape, -1)),
-        )
-        return Faces(*(np.concatenate(part, axis=1) for part in parts))
+        ends = (np.stack((near, far), axis=1), np.stack((far, near), axis=1))
+        start, end = (np.stack((along, y), axis=-1) for along in ends)
+        return _steel(start, end, np.stack((s_near, s_far), axis=1), np.stack((s_far, s_near), axis=1))
+
+    def _pieces(self, x: Array, sight: float) -> Faces:
+        """Rails that follow the road: left, right, and between the road and a ramp that is about to join."""
+        number = x[:, None] // RAIL_PIECE + np.arange(-1, int(sight / RAIL_PIECE) + 1)
+        # Just inside of the piece, for where a ramp begins there is a step.
+        near, far = RAIL_PIECE * number + 1e-3, RAIL_PIECE * (number + 1) - 1e-3
+        shift = self.half_width + 0.5
+        left, right = self.middle - shift, self.middle + shift
+        ends = [(np.stack((u, left + self.shape.bend(u)), axis=-1)) for u in (near, far)]
+        outer = [(np.stack((u, right + self.shape.bend(u) + self._widening(u)), axis=-1)) for u in (far, near)]
+        starts, stops = [ends[0], outer[0]], [ends[1], outer[1]]
+        if self.shape.ramps:
+            # The road's own rail ends where there is no more room for it; from there on it has no length.
+            gap = self.shape.ramp(far)[0] - self.shape.right_edge - 2 * SHOULDER_WIDTH
+            begin = np.where(gap > 1, far, near)
+            starts.append(np.stack((begin, right + 0 * begin), axis=-1))
+            stops.append(np.stack((near, right + 0 * near), axis=-1))
+        start, end = np.concatenate(starts, axis=1), np.concatenate(stops, axis=1)
+        s = np.full(start.shape[:2], RAIL_PIECE / RAIL_JOINTS)
+        return _steel(start, end, 0 * s, s)
+
+    def _widening(self, x: Array) -> Array:
+        """How far a ramp's right edge lies beyond the road's own."""
+        if not self.shape.ramps:
+            return np.zeros_like(x)
+        return np.asarray(self.shape.ramp(x)[1]) - self.shape.right_edge
 
 
-def vehicle_faces(poses: Array, sizes: Array, order: IntArray) -> Faces:
+def _steel(start: Array, end: Array, s_start: Array, s_end: Array) -> Faces:
+    """Guard-rails."""
+    along, one = end - start, np.ones(start.shape[:2])
+    length = np.maximum(np.hypot(along[..., 0], along[..., 1]), 1e-9)[..., None]
+    return Faces(
+        start=start,
+        end=end,
+        normal=np.stack((-along[..., 1], along[..., 0]), axis=-1) / length,
+        s_start=s_start,
+        s_end=s_end,
+        bottom=RAIL_BOTTOM * one,
+        top=RAIL_TOP * one,
+        kind=np.full(one.shape, RAIL),
+        vehicle=np.full(one.shape, -1),
+    )
+
+
+def vehicle_faces(poses: Array, sizes: Array, order: IntArray, front: int = FRONT) -> Faces:
     """
     The four sides of vehicles.
 
     :param poses: Traffic, (instants, vehicles, 3): x, y, heading.
     :param sizes: (vehicles, 2): length, width.
     :param order: (instants, shown): the vehicles to show at each instant, far to near.
+    :param front: Kind of their front faces.
     """
     pose, half = poses[np.arange(len(poses))[:, None], order], 0.5 * sizes[order]
     ahead = np.stack((np.cos(pose[..., 2]), np.sin(pose[..., 2])), axis=-1)
@@ -192,6 +268,6 @@ def vehicle_faces(poses: Array, sizes: Array, order: IntArray) -> Faces:
         s_end=np.ones(shape),
         bottom=np.zeros(shape),
         top=np.full(shape, VEHICLE_HEIGHT),
-        kind=np.tile((REAR, SIDE, FRONT, SIDE), (instants, count)),
+        kind=np.tile((REAR, SIDE, front, SIDE), (instants, count)),
         vehicle=np.repeat(order, 4, axis=1),
     )

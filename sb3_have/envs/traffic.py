@@ -1,17 +1,23 @@
-"""The other vehicles of a highway: IDM/MOBIL drivers in a window that moves with the ego vehicle.
+"""The other vehicles: IDM/MOBIL drivers in a window that moves with the ego vehicle.
 
 The window reaches from :data:`BEHIND` to :data:`AHEAD`. Who leaves it at one end comes back at the other, in a random
 lane with a random speed, so the ego vehicle never runs out of traffic and the density stays what it was. Both ends
-are out of sight: the camera looks forward and draws cars up to 205 m.
+are out of sight: the camera looks forward and draws cars up to 205 m. Oncoming vehicles leave at the rear and come back
+at the front. Ramps get half of those who arrive near the beginning of one: at 40 km/h they take as long to its end as
+the ego vehicle.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from highway_env.road.road import Road
+from highway_env.road.road import LaneIndex, Road
 from highway_env.vehicle.kinematics import Vehicle
 
-from sb3_have.envs.driver import Driver
+from sb3_have.envs.driver import Driver, ScenarioDriver
+from sb3_have.envs.lanes import FORWARD, ONCOMING, ShapedNetwork
+from sb3_have.envs.merging import MergingDriver
+from sb3_have.envs.road import ROAD_LENGTH
+from sb3_have.envs.road_shape import PERIOD, RAMP_JOINS
 
 SIGHT = 300.0
 """No vehicle appears nearer than this ahead of the ego vehicle [m]."""
@@ -19,6 +25,10 @@ AHEAD = SIGHT + 20.0
 """Front end of the window, ahead of the ego vehicle [m]; arrivals are spread over the last 20 m."""
 BEHIND = 120.0
 """Rear end of the window, behind the ego vehicle [m]; arrivals are spread over the last 20 m."""
+RAMP_SPEED = (10.0, 13.0)
+"""Range of speeds at which ramps are driven [m/s]."""
+RAMP_ENTRY = 100.0
+"""Who arrives on a ramp arrives within this distance from its beginning [m]."""
 
 
 def populate(
@@ -39,11 +49,14 @@ def populate(
     """
     for i in range(count):
         for _ in range(tries):
-            vehicle = _random_vehicle(road, ego.position[0] + rng.uniform(-BEHIND, AHEAD), speeds, rng)
+            x = ego.position[0] + rng.uniform(-BEHIND, AHEAD)
+            lanes = _open_lanes(road, x, RAMP_JOINS) + _lanes(road, ONCOMING)
+            vehicle = _random_vehicle(road, lanes, x, speeds, rng)
             if _has_room(vehicle):
                 break
         else:
-            vehicle = _random_vehicle(road, ego.position[0] + AHEAD + 50.0 * (i + 1), speeds, rng)
+            x = ego.position[0] + AHEAD + 50.0 * (i + 1)
+            vehicle = _random_vehicle(road, _lanes(road, FORWARD), x, speeds, rng)
         road.vehicles.append(vehicle)
 
 
@@ -61,17 +74,44 @@ def recycle(road: Road, ego: Vehicle, speeds: tuple[float, float], rng: np.rando
         offset = vehicle.position[0] - ego.position[0]
         if vehicle is ego or -BEHIND <= offset <= AHEAD:
             continue
-        arrival = rng.uniform(SIGHT, AHEAD) if offset < 0 else rng.uniform(-BEHIND, -BEHIND + AHEAD - SIGHT)
-        newcomer = _random_vehicle(road, ego.position[0] + arrival, speeds, rng)
+        oncoming = vehicle.lane_index[:2] == ONCOMING
+        at_front = offset < 0 or oncoming
+        x = ego.position[0] + (rng.uniform(SIGHT, AHEAD) if at_front else rng.uniform(-BEHIND, -BEHIND + AHEAD - SIGHT))
+        lanes = _lanes(road, ONCOMING) if oncoming else _open_lanes(road, x, RAMP_ENTRY if at_front else 0.0)
+        newcomer = _random_vehicle(road, lanes, x, speeds, rng)
         if _has_room(newcomer):
             road.vehicles[i] = newcomer
             replaced.append(i)
     return replaced
 
 
-def _random_vehicle(road: Road, x: float, speeds: tuple[float, float], rng: np.random.Generator) -> Driver:
-    lanes = road.network.all_side_lanes(("0", "1", 0))
-    vehicle: Driver = Driver.make_on_lane(road, lanes[rng.integers(len(lanes))], x, rng.uniform(*speeds))
+def _lanes(road: Road, direction: tuple[str, str]) -> list[LaneIndex]:
+    """The lanes of a direction, without ramps."""
+    lanes = road.network.graph.get(direction[0], {}).get(direction[1], [])
+    return [(*direction, i) for i, lane in enumerate(lanes) if not lane.forbidden]
+
+
+def _open_lanes(road: Road, x: float, ramp_until: float) -> list[LaneIndex]:
+    """Lanes towards +x to draw from: those of the road, and as often a ramp, if x lies in its first metres."""
+    lanes = _lanes(road, FORWARD)
+    ramps = isinstance(road.network, ShapedNetwork) and road.network.ramp is not None
+    return lanes + [(*FORWARD, len(lanes))] * len(lanes) if ramps and x % PERIOD < ramp_until else lanes
+
+
+def _random_vehicle(
+    road: Road, lanes: list[LaneIndex], x: float, speeds: tuple[float, float], rng: np.random.Generator
+) -> Driver:
+    index = lanes[rng.integers(len(lanes))]
+    speed, along = rng.uniform(*speeds), x if index[:2] == FORWARD else ROAD_LENGTH - x
+    vehicle: Driver
+    if not isinstance(road.network, ShapedNetwork):
+        vehicle = Driver.make_on_lane(road, index, along, speed)
+    elif road.network.ramp is None:
+        vehicle = ScenarioDriver.make_on_lane(road, index, along, speed)
+    else:
+        on_ramp = road.network.get_lane(index).forbidden
+        vehicle = MergingDriver.make_on_lane(road, index, along, rng.uniform(*RAMP_SPEED) if on_ramp else speed)
+        vehicle.cruise_speed = speed
     vehicle.DELTA = rng.uniform(*Driver.DELTA_RANGE)
     return vehicle
 
@@ -84,7 +124,8 @@ def _has_room(vehicle: Driver) -> bool:
     for other in vehicle.road.vehicles:
         changing_in = getattr(other, "target_lane_index", None) == vehicle.lane_index
         if changing_in or vehicle.lane.on_lane(other.position, margin=1):
-            pair = (vehicle, other) if vehicle.position[0] < other.position[0] else (other, vehicle)
-            if pair[0].lane_distance_to(pair[1]) < max(vehicle.desired_gap(*pair), 2 * vehicle.LENGTH):
+            behind = (vehicle.position[0] < other.position[0]) == (vehicle.lane_index[:2] == FORWARD)
+            pair = (vehicle, other) if behind else (other, vehicle)
+            if pair[0].lane_distance_to(pair[1], vehicle.lane) < max(vehicle.desired_gap(*pair), 2 * vehicle.LENGTH):
                 return False
     return True

@@ -12,6 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from sb3_have.envs.camera import Camera, Objects
+from sb3_have.envs.road_shape import road_shape
 from sb3_have.envs.scene import PAINTS, Array
 from sb3_have.envs.weather import Illumination, rain_events, take_picture, weather_by_name
 from sb3_have.sensors.depth import encode_depth
@@ -67,6 +68,7 @@ class VisionSensors:
         lane_width: float = 4.0,
         event: Mapping[str, Any] | None = None,
         depth: Mapping[str, Any] | None = None,
+        scenario: str = "highway",
     ) -> None:
         if isinstance(modalities, str) or not modalities or not set(modalities) <= set(MODALITIES):
             raise ValueError(f"modalities must be a non-empty subset of {MODALITIES}, got {modalities!r}")
@@ -85,7 +87,7 @@ class VisionSensors:
                 f"depth max={self.depth_options['max']!r} has no effect with encoding 'log', whose range is fixed; "
                 "leave it out or choose encoding 'clipped' or 'inverse'"
             )
-        self.camera = Camera(image_size, lanes_count, lane_width)
+        self.camera = Camera(image_size, road_shape(scenario, lanes_count, lane_width))
 
         chip = dict(self.event_options)
         self.bins = _whole("event bins", chip.pop("bins"), 1)

@@ -14,8 +14,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_have.envs.camera import SUPERSAMPLING, Camera, Ground, Objects
-from sb3_have.envs.scene import ALBEDO, ASPHALT, LAMP, MARKING, PAINTS, VERGE, Array
+from sb3_have.envs.camera import SUPERSAMPLING, Camera, Objects
+from sb3_have.envs.ground import Ground
+from sb3_have.envs.scene import ALBEDO, ASPHALT, HEADLAMP, LAMP, MARKING, PAINTS, VERGE, Array
 
 Colour = tuple[float, float, float]
 
@@ -152,6 +153,8 @@ HEADLIGHT_REACH: Final = 13.0
 HEADLIGHT_WIDTH: Final = 0.28
 #: Radiance of a tail light.
 TAIL_LIGHT: Final[Colour] = (6e-4, 4e-5, 3e-5)
+#: Radiance of an oncoming car's low beam, seen from outside of its cone.
+LOW_BEAM: Final[Colour] = (2e-2, 1.9e-2, 1.6e-2)
 #: False events per pixel and second in the hardest rain.
 RAIN_EVENT_RATE: Final = 1.5
 
@@ -170,7 +173,7 @@ class Illumination:
         self.weather, self.camera, self.colour = weather, camera, colour
         self.sun, self.ambient, self.horizon = map(self._light, (weather.sun, weather.ambient, weather.horizon))
         self.beam = self._light(HEADLIGHT_COLOUR) * np.float32(HEADLIGHT * weather.night)
-        self.tail = self._light(TAIL_LIGHT) * np.float32(weather.night)
+        self.tail, self.head = (self._light(lamp) * np.float32(weather.night) for lamp in (TAIL_LIGHT, LOW_BEAM))
         self.albedo = self._light(np.concatenate((ALBEDO, PAINTS[paint])))
         wet = np.float32(1 - 0.45 * weather.wetness)
         self.asphalt, self.marking = self._light(ASPHALT) * wet, self._light(MARKING) * (0.5 + 0.5 * wet)
@@ -244,6 +247,8 @@ class Illumination:
         radiance = self.albedo.take(objects.material, axis=1) * received
         if self.weather.night:
             radiance[:, np.flatnonzero(objects.material == LAMP)] += self.tail
+            if self.camera.shape.oncoming:
+                radiance[:, np.flatnonzero(objects.material == HEADLAMP)] += self.head
         return np.asarray(radiance * haze + self.horizon * (1 - haze))
 
 

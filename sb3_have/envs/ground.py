@@ -1,0 +1,155 @@
+"""The flat ground under a camera: what share of every pixel is marking, road and verge.
+
+Nothing is painted: all shares are known in closed form, box-filtered over the pixel's footprint on the ground. Where
+the road runs at an angle to the view, the footprint's length counts as well as its width.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_have.envs.road_shape import PERIOD, RAMP_ENDS, RAMP_JOINS, RoadShape
+from sb3_have.envs.scene import (
+    CENTRE_LINES,
+    DASH_LENGTH,
+    DASH_PERIOD,
+    LINE_WIDTH,
+    RAMP_DASH_PERIOD,
+    SHOULDER_WIDTH,
+    Array,
+    IntArray,
+)
+
+#: A pixel's footprint is taken to be no longer than this [m].
+LONGEST: Final = 200.0
+
+
+@dataclass
+class Ground:
+    """What each pixel under the horizon sees, float32 (instants, rows, columns)."""
+
+    road: Array  # share of the paved road; the rest is verge
+    marking: Array  # share of the road that is painted; the rest is asphalt
+    verge: Array  # brightness factor of the verge's patchwork
+
+    def last(self) -> Ground:
+        """The last instant alone."""
+        return Ground(self.road[-1:], self.marking[-1:], self.verge[-1:])
+
+
+class GroundView:
+    """
+    The ground as a camera sees it.
+
+    :param shape: Of the road.
+    :param forward: Distance of the ground in each row, float32 (rows, 1), in metres.
+    :param right: Its offset to the right in each pixel, float32 (rows, columns).
+    :param focal: Focal length in pixels.
+    :param height: Of the camera in metres.
+    """
+
+    def __init__(self, shape: RoadShape, forward: Array, right: Array, focal: float, height: float) -> None:
+        self.shape, self.forward, self.right = shape, forward, right
+        self.middle = np.float32(0.5 * (shape.lanes_count - 1) * shape.lane_width)
+        self.half_width = np.float32(0.5 * shape.lanes_count * shape.lane_width + SHOULDER_WIDTH)
+        #: Size of a pixel on the ground, (rows, 1).
+        self.wide = forward / np.float32(focal)
+        self.long = np.minimum(self.wide * forward / np.float32(height), np.float32(LONGEST))
+        # The verge is a patchwork of random brightness, the same in every episode.
+        self.patchwork = np.random.default_rng(0).uniform(0.55, 1.45, (64, 64)).astype(np.float32)
+
+    def look(self, x: Array, y: Array, heading: Array) -> Ground:
+        """
+        :param x: Of the camera at each instant, float32 (instants, 1, 1); likewise the others.
+        :param y: In metres.
+        :param heading: In radians.
+        """
+        shape, width = self.shape, np.float32(self.shape.lane_width)
+        sin, cos = np.sin(heading), np.cos(heading)
+        along = x + cos * self.forward - sin * self.right
+        across = y + sin * self.forward + cos * self.right
+        span: Array = self.wide
+        narrow: Array | None = None
+        if shape.swing:
+            across = across - shape.bend(along)
+            span, narrow = self._span(shape.slope(along), sin, cos)
+
+        lane = across / width + np.float32(0.5)
+        line = np.clip(np.rint(lane), 0, shape.lanes_count)
+        distance = np.abs(lane - line) * width
+        beyond = np.abs(across - self.middle) - self.half_width
+        if narrow is not None:
+            distance, beyond = distance * narrow, beyond * narrow
+        marking = _line_share(distance, span)
+        road = np.clip(np.float32(0.5) - beyond / span, 0, 1)
+        # Lines between lanes are dashed.
+        between = (marking != 0) & (line > 0) & (line < shape.lanes_count)
+        if shape.oncoming:
+            self._draw_centre(marking, line, distance, span)
+            between &= line != shape.oncoming
+        self._dash(marking, along, np.flatnonzero(between), DASH_PERIOD)
+        if shape.ramps:
+            beside = (along % PERIOD >= RAMP_JOINS) & (along % PERIOD < RAMP_ENDS)
+            opened = np.flatnonzero((marking != 0) & (line == shape.lanes_count) & beside)
+            self._dash(marking, along, opened, RAMP_DASH_PERIOD)
+            self._add_ramp(marking, road, along, across, sin, cos)
+
+        # Patches of 1 m average out where they are smaller than a pixel.
+        patch = (np.floor(along).astype(np.int32) & 63) * 64 + (np.floor(across).astype(np.int32) & 63)
+        patches = self.patchwork.take(patch)
+        verge = 1 + (patches - 1) * np.minimum(1, 2 / np.maximum(self.wide, self.long))
+        return Ground(road, marking, verge)
+
+    def _span(self, slope: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
+        """
+        Extent of a pixel's footprint square to a line of this slope, and the factor that turns distances along y into
+        distances square to the line.
+        """
+        narrow = 1 / np.sqrt(1 + slope * slope)
+        along, aside = (cos + sin * slope) * narrow, (sin - cos * slope) * narrow
+        return self.wide * np.abs(along) + self.long * np.abs(aside), narrow
+
+    def _dash(self, marking: Array, along: Array, dashed: IntArray, period: float) -> None:
+        """Leave less paint, by the share of the pixel's length that dashes cover."""
+        middle = along.take(dashed)
+        length = self.long[dashed // along.shape[2] % len(self.long), 0]
+        paint = _painted_length(middle + length / 2, period) - _painted_length(middle - length / 2, period)
+        marking.reshape(-1)[dashed] *= paint / length
+
+    def _draw_centre(self, marking: Array, line: Array, distance: Array, span: Array) -> None:
+        """Two solid lines side by side between the directions."""
+        centre = np.flatnonzero(line == self.shape.oncoming)
+        distance, span = distance.take(centre), span.take(centre)
+        both = _line_share(np.abs(distance - CENTRE_LINES), span) + _line_share(distance + CENTRE_LINES, span)
+        marking.reshape(-1)[centre] = np.minimum(both, 1)
+
+    def _add_ramp(self, marking: Array, road: Array, along: Array, across: Array, sin: Array, cos: Array) -> None:
+        """The pavement and the two solid lines of a ramp; its left line ends where the ramp joins the road."""
+        edges, slopes = self.shape.ramp(along), self.shape.ramp_slope(along)
+        beyond: list[Array] = []
+        for sign, edge, slope in zip((1, -1), edges, slopes, strict=True):
+            span, narrow = self._span(slope, sin, cos)
+            outside = sign * (edge - across) * narrow
+            beyond.append((outside - SHOULDER_WIDTH) / span)
+            paint = _line_share(np.abs(outside), span)
+            if sign > 0:
+                paint *= along % PERIOD < RAMP_JOINS
+            np.maximum(marking, paint, out=marking)
+        np.maximum(road, np.clip(np.float32(0.5) - np.maximum(*beyond), 0, 1), out=road)
+
+
+def _line_share(distance: Array, span: Array) -> NDArray[np.float32]:
+    """Share of a footprint of this span that lies on a line, of whose middle its own is so far."""
+    share = np.maximum((LINE_WIDTH / 2 + span / 2 - distance) / span, 0)
+    return np.asarray(np.minimum(share, np.minimum(1, LINE_WIDTH / span)))
+
+
+def _painted_length(x: Array, dash_period: float) -> Array:
+    """Metres of paint on a dashed line between 0 and x."""
+    period = np.floor(x / np.float32(dash_period))
+    painted: Array = period * DASH_LENGTH + np.minimum(x - period * np.float32(dash_period), DASH_LENGTH)
+    return painted

@@ -1,0 +1,132 @@
+"""Lanes of the roads that are not plain: winding ones with traffic both ways, and on-ramps.
+
+Their longitudinal coordinate is x (from the other end on lanes that are driven towards -x), the lateral one is measured
+along y, to the right of who drives on them: the conventions of highway-env's ``SineLane``.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from highway_env.road.lane import LineType
+from highway_env.road.road import LaneIndex, RoadNetwork
+from highway_env.vehicle.kinematics import Vehicle
+
+from sb3_have.envs.road import LANE_WIDTH, ROAD_LENGTH, SPEED_LIMIT, AxisLane
+from sb3_have.envs.road_shape import PERIOD, RAMP_ENDS, RoadShape
+
+FORWARD, ONCOMING = ("0", "1"), ("1", "0")
+"""The two directions in a lane index; lane 0 is the leftmost of those who drive it."""
+
+
+class BentLane(AxisLane):
+    """
+    A lane that bends with its road.
+
+    :param shape: of the road
+    :param number: of the lane, from the left; a lane among ``shape.oncoming`` is driven towards -x
+    """
+
+    def __init__(self, shape: RoadShape, number: int) -> None:
+        y = number * shape.lane_width
+        super().__init__([0.0, y], [ROAD_LENGTH, y], line_types=_line_types(shape, number), speed_limit=SPEED_LIMIT)
+        self.shape, self.centre = shape, y
+        self.sign = -1.0 if number < shape.oncoming else 1.0
+
+    def position(self, longitudinal: float, lateral: float) -> np.ndarray:
+        x = self._mirrored(longitudinal)
+        return np.array([x, self._y(x) + self.sign * lateral])
+
+    def local_coordinates(self, position: np.ndarray) -> tuple[float, float]:
+        x = float(position[0])
+        return self._mirrored(x), self.sign * (float(position[1]) - self._y(x))
+
+    def heading_at(self, longitudinal: float) -> float:
+        along = math.atan(self._slope(self._mirrored(longitudinal)))
+        return along if self.sign > 0 else along + math.pi
+
+    def occupants(self, placed: list[tuple[float, float, Vehicle]]) -> list[tuple[float, Vehicle]]:
+        sign, reach = self.sign, LANE_WIDTH / 2 + 1
+        return [(sign * x, vehicle) for x, y, vehicle in placed if abs(y - self._y(x)) <= reach]
+
+    def _mirrored(self, x: float) -> float:
+        return x if self.sign > 0 else ROAD_LENGTH - x
+
+    def _y(self, x: float) -> float:
+        return self.centre + float(self.shape.bend(x))
+
+    def _slope(self, x: float) -> float:
+        return float(self.shape.slope(x))
+
+
+class RampLane(BentLane):
+    """
+    All on-ramps of a road, one per period. Nobody changes to it; where it tapers off it is narrower.
+
+    :param shape: of the road, which is straight
+    """
+
+    def __init__(self, shape: RoadShape) -> None:
+        super().__init__(shape, shape.lanes_count)
+        self.forbidden = True
+
+    def on_lane(
+        self, position: np.ndarray, longitudinal: float | None = None, lateral: float | None = None, margin: float = 0
+    ) -> bool:
+        x, y = float(position[0]), float(position[1])
+        left, right = self.shape.ramp(x)
+        return self.exists(x) and left - margin <= y <= right + margin
+
+    def occupants(self, placed: list[tuple[float, float, Vehicle]]) -> list[tuple[float, Vehicle]]:
+        edge = self.shape.right_edge - 1
+        return [(x, v) for x, y, v in placed if y >= edge and self.on_lane(v.position, margin=1)]
+
+    def exists(self, x: float) -> bool:
+        """Whether there is a ramp at x."""
+        return x % PERIOD < RAMP_ENDS
+
+    def _y(self, x: float) -> float:
+        return float(self.shape.ramp(x)[0]) + 0.5 * self.shape.lane_width
+
+    def _slope(self, x: float) -> float:
+        return float(self.shape.ramp_slope(x)[0])
+
+
+class ShapedNetwork(RoadNetwork):
+    """
+    The lanes of a road.
+
+    :param shape: of the road
+    """
+
+    def __init__(self, shape: RoadShape) -> None:
+        super().__init__()
+        self.shape = shape
+        for number in range(shape.oncoming, shape.lanes_count):
+            self.add_lane(*FORWARD, BentLane(shape, number))
+        for number in reversed(range(shape.oncoming)):
+            self.add_lane(*ONCOMING, BentLane(shape, number))
+        self.ramp: RampLane | None = None
+        if shape.ramps:
+            self.ramp = RampLane(shape)
+            self.add_lane(*FORWARD, self.ramp)
+
+    def get_closest_lane_index(self, position: np.ndarray, heading: float | None = None) -> LaneIndex:
+        # By place alone: who drives on the wrong side is on the wrong side.
+        shape, x, y = self.shape, float(position[0]), float(position[1])
+        across = y - shape.bend(x)
+        number = min(max(round(across / shape.lane_width), 0), shape.lanes_count - 1)
+        if self.ramp is not None and across > shape.right_edge and self.ramp.exists(x):
+            past_road, past_ramp = across - shape.right_edge, abs(self.ramp.local_coordinates(position)[1])
+            if past_ramp < past_road + 0.5 * shape.lane_width:
+                return *FORWARD, shape.lanes_count
+        if number < shape.oncoming:
+            return *ONCOMING, shape.oncoming - 1 - number
+        return *FORWARD, number - shape.oncoming
+
+
+def _line_types(shape: RoadShape, number: int) -> tuple[LineType, LineType]:
+    """Lines to the left and to the right, as seen with +x ahead; every line belongs to one lane."""
+    left = LineType.CONTINUOUS_LINE if number in (0, shape.oncoming) else LineType.STRIPED
+    return left, LineType.CONTINUOUS_LINE if number == shape.lanes_count - 1 else LineType.NONE
