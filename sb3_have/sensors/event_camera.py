@@ -66,8 +66,8 @@ class EventCamera:
 
     :param height: Rows of the sensor.
     :param width: Columns of the sensor.
-    :param threshold: Contrast threshold C in units of the mapped intensity (log units for ``mapping="log"``),
-        one number or ``(positive, negative)``.
+    :param threshold: Contrast threshold C in units of the mapped intensity, one number or ``(positive, negative)``.
+        Of logarithms these are natural log units: 0.2 is a change by 22%.
     :param threshold_sigma: Standard deviation of C over the pixels, in the same units. Drawn once per pixel: it is a
         property of the chip. Draws are floored at a tenth of the nominal threshold.
     :param refractory: Dead time of a pixel after an event, in seconds. A crossing in the dead time is lost, and the
@@ -82,7 +82,7 @@ class EventCamera:
         order, time constant 1 / (2 pi cutoff_hz), exact for an input that is linear in time between the frames. None
         is an unlimited bandwidth.
     :param cutoff_intensity: Intensity from which on the bandwidth is ``cutoff_hz``. In less light it shrinks in
-        proportion, to no less than a tenth, as in v2e. The intensity is the new frame's, so how finely a film is cut
+        proportion, to no less than a tenth, much as in v2e. The intensity is the new frame's, so how finely a film is cut
         into frames then makes a small difference. None: the same bandwidth in any light.
     :param seed: Seed of the threshold mismatch, the leak phases and the noise.
     :raises ValueError: on a parameter out of its range.
