@@ -50,7 +50,7 @@ class Server:
         self._blocked = 0
         self._impulses: list[tuple[float, float, float]] = []
         self._waiting: list[tuple[int, Sensor, SensorData]] = []
-        self._threads: list[threading.Thread] = []
+        self._threads: dict[int, threading.Thread] = {}  # the last of each sensor
         self.load(town)
 
     # ---- switches ----
@@ -136,7 +136,7 @@ class Server:
 
     def join(self) -> None:
         """Wait for the callbacks that are still on their way."""
-        for thread in self._threads:
+        for thread in self._threads.values():
             thread.join()
         self._threads.clear()
 
@@ -265,7 +265,11 @@ class Server:
         if callback is None:
             return
 
+        before = self._threads.get(sensor.id)
+
         def run() -> None:
+            if before is not None:
+                before.join()  # a sensor's data come in order
             time.sleep(delay)
             try:
                 callback(data)
@@ -274,8 +278,8 @@ class Server:
             data._die()
 
         if self.threaded or delay:
-            self._threads.append(threading.Thread(target=run, daemon=True))
-            self._threads[-1].start()
+            self._threads[sensor.id] = threading.Thread(target=run, daemon=True)
+            self._threads[sensor.id].start()
         else:
             run()
 

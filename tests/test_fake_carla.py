@@ -224,14 +224,15 @@ def mount(world: Any, ego: Any, kind: str, callback: Callable[[Any], Any]) -> An
 
 def test_blueprints_are_strict(monkeypatch: pytest.MonkeyPatch) -> None:
     library = start(monkeypatch, Server()).get_blueprint_library()
-    for refused, call in [
+    cases: list[tuple[type[Exception], Callable[[], Any]]] = [
         (IndexError, lambda: library.find("sensor.camera.rbg")),
         (IndexError, lambda: library.find("sensor.camera.rgb").set_attribute("width", "8")),
         (TypeError, lambda: library.find("sensor.camera.rgb").set_attribute("image_size_x", 8)),
         (ValueError, lambda: library.find("sensor.camera.rgb").set_attribute("image_size_x", "8.5")),
         (ValueError, lambda: library.find("sensor.camera.dvs").set_attribute("use_log", "yes")),
         (ValueError, lambda: library.find("vehicle.tesla.model3").set_attribute("number_of_wheels", "3")),
-    ]:
+    ]
+    for refused, call in cases:
         with pytest.raises(refused):
             call()
     assert library.find("vehicle.tesla.model3").get_attribute("base_type").as_str() == "car"
