@@ -147,8 +147,12 @@ def rendered_depth(env: gym.Env[Any, Any], depth: Array) -> Array:
     model: Any = getattr(base, "model", None)
     if not hasattr(base, "mujoco_renderer") or not hasattr(getattr(model, "vis", None), "map"):
         return depth
-    camera = base.mujoco_renderer.camera_id
-    orthographic = model.vis.global_.orthographic if camera is None or camera < 0 else model.cam_projection[camera]
+    renderer = base.mujoco_renderer
+    free = renderer.camera_id is None or renderer.camera_id < 0
+    if free:
+        orthographic = renderer.viewer.cam.orthographic
+    else:
+        orthographic = hasattr(model, "cam_projection") and model.cam_projection[renderer.camera_id]
     # MuJoCo gives both planes in units of the size of the model.
     near, far = (float(plane * model.stat.extent) for plane in (model.vis.map.znear, model.vis.map.zfar))
     return depth_from_zbuffer(depth, near, far, bool(orthographic))
