@@ -135,6 +135,8 @@ def test_a_storm_alternates_from_bin_to_bin_and_is_everywhere() -> None:
         starts.add(np.sign(bins[0]))
     assert starts == {-1, 1}
     assert (decode_events(corrupt("event_storm", "event", 3, image)) != 0).mean() > 0.99
+    flood = f.storm(image, np.random.default_rng(0), 500.0)
+    assert set(np.unique(flood)) == {1, 255}  # full scale, and never "no data"
 
 
 def test_salt_and_pepper_hit_their_share_of_pixels_in_all_channels() -> None:
