@@ -104,6 +104,16 @@ def test_a_level_at_rest_on_a_threshold_fires_no_more(threshold: float, level: f
     assert [len(camera.step([[level]], t)) for t in (2.0, 3.0)] == [0, 0]
 
 
+@pytest.mark.parametrize("start, count", [(-6.0, 3), (-2.0, 11)])
+def test_a_level_on_a_threshold_reaches_it_and_one_bit_below_does_not(start: float, count: int) -> None:
+    # The quotient of change and threshold rounds down in the first case, and up in the second.
+    on = start + count * 0.1
+    for level, expected in ((on, count), (np.nextafter(on, -9.0), count - 1)):
+        camera = EventCamera(1, 1, threshold=0.1, mapping="identity")
+        camera.step([[start]], 0.0)
+        assert len(camera.step([[level]], 1.0)) == expected
+
+
 @pytest.mark.parametrize("sigma", [0.0, 0.05])
 @pytest.mark.parametrize("threshold", [0.2, (0.15, 0.3)])
 def test_equals_a_loop_over_pixels(sigma: float, threshold: float | tuple[float, float]) -> None:
