@@ -168,6 +168,14 @@ def test_every_window_is_that_of_a_mask(tmp_path: Path, index: str, monkeypatch:
     assert_same(read_events(path, -1.0, np.inf), events)
 
 
+def test_an_index_into_the_middle_of_simultaneous_events(tmp_path: Path) -> None:
+    events = recording(len(DSEC_TIMES) * 4)[: len(DSEC_TIMES)]
+    events["t"] = np.array(DSEC_TIMES) / 1e6
+    path = put(tmp_path / "events.h5", events)
+    put_index(path, "ms_to_idx", [*DSEC_INDEX[:5], 4, *DSEC_INDEX[6:]])
+    assert_same(read_events(path, 0.005, 0.0055), events[3:5])
+
+
 @pytest.mark.parametrize("convention", ["dsec", "m3ed"])
 def test_what_is_written_is_read(tmp_path: Path, convention: Convention) -> None:
     events, path = recording(), tmp_path / "events.h5"
@@ -256,6 +264,20 @@ def test_windows_hold_every_event_once(tmp_path: Path) -> None:
         for bad in (0.0, -1.0, np.nan, np.inf):
             with pytest.raises(ValueError, match="finite duration > 0"):
                 recorded.windows(bad)
+
+
+@pytest.mark.parametrize(
+    ("times", "counts"), [((0.35, 0.36), [1, 0, 1]), ((0.01, 0.02), [1, 1]), ((0.0,), [1])], ids=str
+)
+def test_events_on_the_edge_of_a_window(tmp_path: Path, times: tuple[float, ...], counts: list[int]) -> None:
+    """In floating point 35 times 0.01 lies above 0.35, which then belongs to the window before."""
+    events = np.zeros(len(times), EVENT_DTYPE)
+    events["t"], events["p"] = times, 1
+    write_events(tmp_path / "events.h5", events, HEIGHT, WIDTH)
+    with EventFile(tmp_path / "events.h5") as recorded:
+        windows = list(recorded.windows(0.01))
+    assert [len(inside) for *_, inside in windows] == counts
+    assert all(t0 <= t < t1 for t0, t1, inside in windows for t in inside["t"])
 
 
 def test_windows_begin_with_the_first_event(tmp_path: Path) -> None:
@@ -476,7 +498,7 @@ def test_files_that_cannot_be_opened(tmp_path: Path) -> None:
         EventFile(tmp_path / "empty.h5")
     path = put(tmp_path / "cut.h5", recording())
     path.write_bytes(path.read_bytes()[:-200])
-    with pytest.raises(OSError, match=r"cannot open .*cut\.h5.*truncated, copy it again"):
+    with pytest.raises(OSError, match=r"cannot open .*cut\.h5.*truncated .copy it again.,"):
         EventFile(path)
     path = put(tmp_path / "rotten.h5", recording(), compression="gzip", fletcher32=True)
     with h5py.File(path) as file:

@@ -294,9 +294,8 @@ def _open(h5py: Any, path: Path) -> Any:
     try:
         return h5py.File(path, "r")
     except OSError as error:
-        if type(error) is not OSError:  # no permission, or locked by a writer
-            raise
-        raise OSError(f"cannot open {path}: {error}; the file is damaged or truncated, copy it again") from error
+        reason = "it is damaged or truncated (copy it again), or a writer still has it open"
+        raise OSError(f"cannot open {path}: {error}; {reason}") from error
 
 
 def _select(h5py: Any, file: Any, path: Path, group: str | None) -> tuple[str, dict[str, _Column]]:
