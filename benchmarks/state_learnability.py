@@ -1,9 +1,11 @@
 """Is the driving task of HighwayVision-v0 learnable at all, and which choices decide it? No pixels: a state vector.
 
     python -m benchmarks.state_learnability drivers                                # drivers that do not learn
+    python -m benchmarks.state_learnability drivers --scenarios merge curves       # the same on other roads
     python -m benchmarks.state_learnability train --settings default --seeds 0 1   # stock SAC, two seeds at a time
 
-Every evaluation is appended to ``benchmarks/results/state_learnability.csv`` as it is made.
+Every evaluation is appended to ``benchmarks/results/state_learnability.csv`` as it is made; the name of a setting
+begins with that of the scenario where it is not the highway.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from stable_baselines3 import SAC
 
 from sb3_have.envs.highway_vision import HighwayVisionEnv
 from sb3_have.envs.road import LANE_WIDTH
+from sb3_have.envs.road_shape import SCENARIOS
 
 RESULTS = Path(__file__).parent / "results" / "state_learnability.csv"
 COLUMNS = ["setting", "seed", "step", "episodes", "distance_mean", "distance_std", "distance_max"]
@@ -61,6 +64,7 @@ SETTINGS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 class StateObservation(ObservationType):  # type: ignore[misc]  # highway-env is untyped
     """19 values: own lateral position, offset from the lane's centre, heading and speed, and for the lane to the left,
     the own and the one to the right: whether it exists, gap and speed difference to the next vehicle ahead and behind.
+    All relative to the road; lanes are those in one direction.
     """
 
     def space(self) -> spaces.Box:
@@ -69,13 +73,15 @@ class StateObservation(ObservationType):  # type: ignore[misc]  # highway-env is
     def observe(self) -> np.ndarray:
         ego, road = self.env.vehicle, self.env.road
         width = self.env.lanes_count * LANE_WIDTH
-        y = ego.position[1]
-        own = ego.lane_index[2]
-        state = [2 * y / width, (y - own * LANE_WIDTH) / LANE_WIDTH, 10 * ego.heading, ego.speed / 15 - 1]
+        y = ego.position[1] - self.env.shape.bend(ego.position[0])
+        along, lateral = ego.lane.local_coordinates(ego.position)
+        *direction, own = ego.lane_index
+        state = [2 * y / width, lateral / LANE_WIDTH, 10 * ego.lane.local_angle(ego.heading, along)]
+        state.append(ego.speed / 15 - 1)
         for lane in (own - 1, own, own + 1):
-            exists = 0 <= lane < self.env.lanes_count
+            exists = 0 <= lane < len(road.network.all_side_lanes(ego.lane_index))
             state.append(float(exists))
-            front, rear = road.neighbour_vehicles(ego, ("0", "1", lane)) if exists else (None, None)
+            front, rear = road.neighbour_vehicles(ego, (*direction, lane)) if exists else (None, None)
             for other in (front, rear):
                 gap = SEEN if other is None else min(abs(other.position[0] - ego.position[0]), SEEN)
                 closing = 0.0 if other is None or gap == SEEN else ego.speed - other.speed
@@ -147,7 +153,7 @@ def record(row: dict[str, Any], path: Path) -> None:
     print(" ".join(f"{key}={value}" for key, value in row.items()), flush=True)
 
 
-def run_drivers(path: Path, episodes: int) -> None:
+def run_drivers(scenario: str, path: Path, episodes: int) -> None:
     """Drivers that do not learn."""
     rng = np.random.default_rng(0)
     drivers: dict[str, tuple[type[StateEnv], Driver]] = {
@@ -157,8 +163,10 @@ def run_drivers(path: Path, episodes: int) -> None:
     }
     for name, (env_class, driver) in drivers.items():
         start = time.perf_counter()
-        result = evaluate(env_class(), driver, range(10_000, 10_000 + episodes))
-        record({"setting": name, "seed": "", "step": 0, **result, "seconds": round(time.perf_counter() - start)}, path)
+        result = evaluate(env_class(scenario=scenario), driver, range(10_000, 10_000 + episodes))
+        setting = name if scenario == "highway" else f"{scenario}_{name}"
+        seconds = round(time.perf_counter() - start)
+        record({"setting": setting, "seed": "", "step": 0, **result, "seconds": seconds}, path)
 
 
 def train(setting: str, seed: int, steps: int, every: int, episodes: int, path: Path) -> None:
@@ -182,6 +190,7 @@ def train(setting: str, seed: int, steps: int, every: int, episodes: int, path: 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["drivers", "train"])
+    parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=["highway"], help="for drivers")
     parser.add_argument("--settings", nargs="+", choices=list(SETTINGS), default=["default"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
     parser.add_argument("--steps", type=int, default=20_000)
@@ -191,7 +200,8 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
     if args.what == "drivers":
-        run_drivers(args.out, args.episodes or 20)
+        for scenario in args.scenarios:
+            run_drivers(scenario, args.out, args.episodes or 20)
         return
     with ProcessPoolExecutor(args.jobs) as pool:
         runs = [

@@ -70,18 +70,17 @@ class GroundView:
         """
         shape, width = self.shape, np.float32(self.shape.lane_width)
         sin, cos = np.sin(heading), np.cos(heading)
-        along = x + cos * self.forward - sin * self.right
-        across = y + sin * self.forward + cos * self.right
-        span: Array = self.wide
-        narrow: Array | None = None
+        along: Array = x + cos * self.forward - sin * self.right
+        across: Array = y + sin * self.forward + cos * self.right
+        span, narrow = self.wide, None
         if shape.swing:
             across = across - shape.bend(along)
-            span, narrow = self._span(shape.slope(along), sin, cos)
+            span, narrow = self._footprint(shape.slope(along), sin, cos)
 
         lane = across / width + np.float32(0.5)
-        line = np.clip(np.rint(lane), 0, shape.lanes_count)
-        distance = np.abs(lane - line) * width
-        beyond = np.abs(across - self.middle) - self.half_width
+        line: Array = np.clip(np.rint(lane), 0, shape.lanes_count)
+        distance: Array = np.abs(lane - line) * width
+        beyond: Array = np.abs(across - self.middle) - self.half_width
         if narrow is not None:
             distance, beyond = distance * narrow, beyond * narrow
         marking = _line_share(distance, span)
@@ -104,7 +103,7 @@ class GroundView:
         verge = 1 + (patches - 1) * np.minimum(1, 2 / np.maximum(self.wide, self.long))
         return Ground(road, marking, verge)
 
-    def _span(self, slope: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
+    def _footprint(self, slope: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
         """
         Extent of a pixel's footprint square to a line of this slope, and the factor that turns distances along y into
         distances square to the line.
@@ -132,7 +131,7 @@ class GroundView:
         edges, slopes = self.shape.ramp(along), self.shape.ramp_slope(along)
         beyond: list[Array] = []
         for sign, edge, slope in zip((1, -1), edges, slopes, strict=True):
-            span, narrow = self._span(slope, sin, cos)
+            span, narrow = self._footprint(slope, sin, cos)
             outside = sign * (edge - across) * narrow
             beyond.append((outside - SHOULDER_WIDTH) / span)
             paint = _line_share(np.abs(outside), span)

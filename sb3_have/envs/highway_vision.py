@@ -49,8 +49,9 @@ class HighwayVisionEnv(AbstractEnv):
         v_s / max_speed - steer_cost * |steer| - brake_cost * max(0, -throttle) - crash_penalty * (crashed or off road)
 
     with v_s the mean speed along the road during the step [m/s], the motion projected on its direction. A crash or
-    leaving the road terminates the episode, ``max_episode_steps`` truncates it. ``info`` after reset and every step: ``distance`` (sum of v_s dt so far [m]),
-    ``speed`` [m/s], ``crashed``, ``offroad``, ``weather``, ``end_reason`` ("crash", "offroad", "timeout" or None).
+    leaving the road terminates the episode, ``max_episode_steps`` truncates it. ``info`` after reset and every step:
+    ``distance`` (sum of v_s dt so far [m]), ``speed`` [m/s], ``crashed``, ``offroad``, ``weather``, ``end_reason``
+    ("crash", "offroad", "timeout" or None).
 
     The traffic is highway-env's IDM/MOBIL drivers in a window that moves along (:mod:`sb3_have.envs.traffic`). The
     same seed gives the same bits; traffic and sensors draw from separate streams, so that episodes with the same seed
@@ -295,7 +296,7 @@ class HighwayVisionEnv(AbstractEnv):
         if self.render_mode is None:
             gym.logger.warn('render() needs render_mode="rgb_array", given to gym.make or the constructor.')
             return None
-        return compose(self._observation)
+        return compose(self._observation, representation=self.sensors.representation)
 
 
 class ReportTimeout(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructorArgs):

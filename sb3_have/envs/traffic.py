@@ -3,8 +3,8 @@
 The window reaches from :data:`BEHIND` to :data:`AHEAD`. Who leaves it at one end comes back at the other, in a random
 lane with a random speed, so the ego vehicle never runs out of traffic and the density stays what it was. Both ends
 are out of sight: the camera looks forward and draws cars up to 205 m. Oncoming vehicles leave at the rear and come back
-at the front. Ramps get half of those who arrive near the beginning of one: at 40 km/h they take as long to its end as
-the ego vehicle.
+at the front. Where a ramp begins, out of sight, half of those who arrive do so on the ramp, slowly enough for the ego
+vehicle to catch up with them where they join the road.
 """
 
 from __future__ import annotations
@@ -27,6 +27,8 @@ BEHIND = 120.0
 """Rear end of the window, behind the ego vehicle [m]; arrivals are spread over the last 20 m."""
 RAMP_SPEED = (10.0, 13.0)
 """Range of speeds at which ramps are driven [m/s]."""
+BEHIND_RAMP = 40.0
+"""Rear end of the window while a ramp begins out of sight ahead [m]: who is farther behind is needed there."""
 RAMP_ENTRY = 100.0
 """Who arrives on a ramp arrives within this distance from its beginning [m]."""
 
@@ -70,9 +72,10 @@ def recycle(road: Road, ego: Vehicle, speeds: tuple[float, float], rng: np.rando
     :return: indices into ``road.vehicles`` of the vehicles that were replaced
     """
     replaced = []
+    behind = BEHIND_RAMP if _on_ramp(road, ego.position[0] + SIGHT, RAMP_ENTRY) else BEHIND
     for i, vehicle in enumerate(road.vehicles):
         offset = vehicle.position[0] - ego.position[0]
-        if vehicle is ego or -BEHIND <= offset <= AHEAD:
+        if vehicle is ego or -behind <= offset <= AHEAD:
             continue
         oncoming = vehicle.lane_index[:2] == ONCOMING
         at_front = offset < 0 or oncoming
@@ -94,8 +97,12 @@ def _lanes(road: Road, direction: tuple[str, str]) -> list[LaneIndex]:
 def _open_lanes(road: Road, x: float, ramp_until: float) -> list[LaneIndex]:
     """Lanes towards +x to draw from: those of the road, and as often a ramp, if x lies in its first metres."""
     lanes = _lanes(road, FORWARD)
-    ramps = isinstance(road.network, ShapedNetwork) and road.network.ramp is not None
-    return lanes + [(*FORWARD, len(lanes))] * len(lanes) if ramps and x % PERIOD < ramp_until else lanes
+    return lanes + [(*FORWARD, len(lanes))] * len(lanes) if _on_ramp(road, x, ramp_until) else lanes
+
+
+def _on_ramp(road: Road, x: float, until: float) -> bool:
+    """Whether x lies in the first metres of a ramp."""
+    return isinstance(road.network, ShapedNetwork) and road.network.ramp is not None and x % PERIOD < until
 
 
 def _random_vehicle(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
-from typing import Any, Final, get_args
+from typing import Any, Final
 
 import cv2
 import numpy as np
@@ -17,7 +17,14 @@ from sb3_have.envs.scene import PAINTS, Array
 from sb3_have.envs.weather import Illumination, rain_events, take_picture, weather_by_name
 from sb3_have.sensors.depth import encode_depth
 from sb3_have.sensors.event_camera import EventCamera
-from sb3_have.sensors.representations import EVENT_ZERO, Representation, decode_events, encode_events, represent
+from sb3_have.sensors.representations import (
+    EVENT_ZERO,
+    Representation,
+    channels,
+    decode_events,
+    encode_events,
+    represent,
+)
 
 Observation = dict[str, NDArray[np.uint8]]
 
@@ -34,6 +41,9 @@ EVENT_DEFAULTS: Final[Mapping[str, Any]] = {
     "shot_rate": 0.0,
     "mapping": "log",
     "log_eps": 1e-7,
+    "cutoff_hz": None,
+    "cutoff_intensity": None,
+    "tau": None,
     "seed": 0,
 }
 DEPTH_DEFAULTS: Final[Mapping[str, Any]] = {"encoding": "log", "max": 100.0}
@@ -41,22 +51,24 @@ DEPTH_DEFAULTS: Final[Mapping[str, Any]] = {"encoding": "log", "max": 100.0}
 
 class VisionSensors:
     """
-    Roof camera, event camera and depth camera of the ego vehicle on a straight road.
+    Roof camera, event camera and depth camera of the ego vehicle.
 
     Only what the chosen modalities need is computed: an event camera needs several instants of each control step, the
     others only the last.
 
     :param image_size: Rows and columns of every image.
     :param modalities: Non-empty subset of ``"rgb"``, ``"event"``, ``"depth"``.
-    :param lanes_count: Lanes of the road; the centre of lane k lies at y = k * lane_width, y to the right.
+    :param lanes_count: Lanes of the road; where it is straight, the centre of lane k lies at y = k * lane_width, y to
+        the right.
     :param lane_width: In metres.
-    :param event: Overrides of :data:`EVENT_DEFAULTS`: ``bins`` (channels), ``subframes`` (instants rendered per control
-        step), ``representation`` ("sbt", "voxel", "count") and the parameters of
-        :class:`~sb3_have.sensors.EventCamera`. ``seed`` fixes the chip's threshold mismatch; all noise comes from the
-        generators given to :meth:`reset` and :meth:`observe`. With a ``mapping`` other than "log" the event camera
-        sees the digital numbers of the colour camera, neither clipped nor rounded.
+    :param event: Overrides of :data:`EVENT_DEFAULTS`: ``bins``, ``subframes`` (instants rendered per control step),
+        ``representation`` and, for a time surface, ``tau`` as :func:`~sb3_have.sensors.represent` has them (one control
+        step each), and the parameters of :class:`~sb3_have.sensors.EventCamera`. ``seed`` fixes the chip's threshold
+        mismatch; all noise comes from the generators given to :meth:`reset` and :meth:`observe`. With a ``mapping``
+        other than "log" the event camera sees the digital numbers of the colour camera, neither clipped nor rounded.
     :param depth: Overrides of :data:`DEPTH_DEFAULTS`: ``encoding`` ("log", "clipped", "inverse") and, for the latter
         two, ``max`` in metres.
+    :param scenario: The road, see :func:`~sb3_have.envs.road_shape.road_shape`.
     :raises ValueError: on an unknown modality, option or value.
     """
 
@@ -92,16 +104,17 @@ class VisionSensors:
         chip = dict(self.event_options)
         self.bins = _whole("event bins", chip.pop("bins"), 1)
         self.subframes = _whole("event subframes", chip.pop("subframes"), 1)
-        self._representation = chip.pop("representation")
+        #: What the event image shows, see :func:`~sb3_have.sensors.represent`.
+        self.representation: Representation = chip.pop("representation")
+        self._tau = chip.pop("tau")
+        event_channels = channels(self.representation, self.bins)
+        self._represent(np.empty(0, np.int64), np.empty(0), np.empty(0), 0.0, 1.0)  # complains about a wrong tau now
         self.event_camera = EventCamera(image_size, image_size, **chip)
-        if self._representation not in get_args(Representation):
-            known = get_args(Representation)
-            raise ValueError(f"event representation must be one of {known}, got {self._representation!r}")
 
-        channels = {"rgb": 3, "event": self.bins, "depth": 1}
+        depths = {"rgb": 3, "event": event_channels, "depth": 1}
         #: Space of each modality: uint8 (image_size, image_size, channels).
         self.spaces: dict[str, spaces.Box] = {
-            name: spaces.Box(0, 255, (image_size, image_size, channels[name]), np.uint8) for name in self.modalities
+            name: spaces.Box(0, 255, (image_size, image_size, depths[name]), np.uint8) for name in self.modalities
         }
         self._sizes: Array = np.empty((0, 2))
         self._view: Objects | None = None
@@ -206,13 +219,24 @@ class VisionSensors:
         times = [start + duration * (k + 1) / len(frames) for k in range(len(frames))]
         parts = [self.event_camera.detect(frame, t, rng) for frame, t in zip(frames, times, strict=True)]
         if duration == 0:
-            return np.full((size, size, self.bins), EVENT_ZERO, dtype=np.uint8)
+            return np.full(self.spaces["event"].shape, EVENT_ZERO, dtype=np.uint8)
         self._time = times[-1]
         if self.weather.rain:
             parts.append(rain_events(self.weather, start, self._time, size, size, rng))
         pixel, time, polarity = (np.concatenate(part) for part in zip(*parts, strict=True))
-        counts = represent(pixel, time, polarity, self.bins, start, self._time, size, size, self._representation)
-        return encode_events(counts)
+        return self._represent(pixel, time, polarity, start, self._time)
+
+    def _represent(
+        self,
+        pixel: NDArray[np.int64],
+        times: NDArray[np.float64],
+        polarity: NDArray[np.float64],
+        start: float,
+        end: float,
+    ) -> NDArray[np.uint8]:
+        size, kind = self.image_size, self.representation
+        values = represent(pixel, times, polarity, self.bins, start, end, size, size, kind, self._tau)
+        return encode_events(values, kind)
 
 
 def _whole(name: str, value: Any, least: int) -> int:
@@ -228,24 +252,36 @@ def _options(name: str, defaults: Mapping[str, Any], given: Mapping[str, Any] | 
     return {**defaults, **(given or {})}
 
 
-def compose(observation: Mapping[str, NDArray[np.uint8]], scale: int = 4) -> NDArray[np.uint8]:
+def compose(
+    observation: Mapping[str, NDArray[np.uint8]], scale: int = 4, representation: Representation = "sbt"
+) -> NDArray[np.uint8]:
     """
     One picture of an observation, RGB | event | depth from left to right, for people to look at.
 
     :param observation: Any non-empty subset of the modalities, (H, W, C) uint8 each.
     :param scale: Pixels on the screen per pixel of the image.
+    :param representation: Of the events.
     :return: uint8 (H * scale, W * scale * modalities, 3). Events: red brighter, blue darker, on white. Depth:
         near yellow, far violet, no data black.
     """
-    shown = [_PAINTERS[name](np.asarray(observation[name])) for name in MODALITIES if name in observation]
+    shown = [_paint(name, np.asarray(observation[name]), representation) for name in MODALITIES if name in observation]
     if not shown:
         raise ValueError(f"observation has none of {MODALITIES}, only {sorted(observation)}")
     return np.concatenate(shown, axis=1).repeat(scale, axis=0).repeat(scale, axis=1)
 
 
-def _paint_events(codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    total = decode_events(codes).sum(axis=-1)
-    strength = np.clip(np.abs(total) / 4, 0, 1)[..., None]
+def _paint(name: str, image: NDArray[np.uint8], representation: Representation) -> NDArray[np.uint8]:
+    if name == "rgb":
+        return image[..., -3:]
+    return _paint_depth(image) if name == "depth" else _paint_events(image, representation)
+
+
+def _paint_events(codes: NDArray[np.uint8], representation: Representation) -> NDArray[np.uint8]:
+    values, full = decode_events(codes, representation), 1.0 if representation == "time_surface" else 4.0
+    if representation in ("polarity", "time_surface"):  # positive channels first, then as many negative ones
+        values[..., values.shape[-1] // 2 :] *= -1
+    total = values.sum(axis=-1)
+    strength = np.clip(np.abs(total) / full, 0, 1)[..., None]
     colour = np.where(total[..., None] > 0, (214.0, 39.0, 40.0), (31.0, 119.0, 220.0))
     return np.asarray(255 + strength * (colour - 255)).astype(np.uint8)
 
@@ -253,6 +289,3 @@ def _paint_events(codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
 def _paint_depth(codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
     coloured = cv2.applyColorMap(255 - codes[..., -1], cv2.COLORMAP_INFERNO)[..., ::-1]
     return np.asarray(np.where(codes[..., -1:] == 0, 0, coloured)).astype(np.uint8)
-
-
-_PAINTERS: Final = {"rgb": lambda image: image[..., -3:], "event": _paint_events, "depth": _paint_depth}
