@@ -33,6 +33,7 @@ class Server:
         self.port, self.version = port, "0.9.16"
         self.alive, self.life, self.episode = True, 0, 0
         self.calls: list[str] = []  # every call, "World.tick"
+        self.missed = 0  # calls that waited in vain
         self.violations: list[str] = []  # what the real client allows, though it does harm
         self.sent: dict[str, dict[int, Any]] = {}  # type of sensor -> frame -> data
         self.settings = carla.WorldSettings()
@@ -56,7 +57,7 @@ class Server:
     # ---- switches ----
 
     def fail(self, call: str, error: BaseException, after: int = 0, done: bool = False) -> None:
-        """The call after the next ``after`` ones raises ``error``; "World.tick", "Sensor.stop" and so on.
+        """The call after the next ``after`` ones raises ``error``; "World.tick", "Sensor.stop" and so on, "*" for any.
 
         :param done: the server has done its work when the error strikes
         """
@@ -71,7 +72,7 @@ class Server:
 
     def restart(self, town: str = "Town04") -> None:
         """A fresh server at the same port; no handle of before is good for anything."""
-        self.alive, self.life = True, self.life + 1
+        self.alive, self.life, self.missed = True, self.life + 1, 0
         self.settings, self.frame, self.elapsed = carla.WorldSettings(), 3, 0.5
         self.load(town)
 
@@ -156,7 +157,7 @@ class Server:
     def note(self, call: str, handle: Any) -> bool:
         """Record a call; raise what was arranged for it; tell whether the handle belongs to this server's world."""
         self.calls.append(call)
-        self._count[call] += 1
+        self._count.update((call, "*"))
         self._strike(call, done=False)
         return self.alive and handle._life == self.life
 
@@ -165,15 +166,16 @@ class Server:
         self._strike(call, done=True)
 
     def _strike(self, call: str, done: bool) -> None:
-        key = (call, self._count[call], done)
-        if key in self._failures:
-            error = self._failures.pop(key)
-            if error is not None:
-                raise error
-            self.alive = False
+        for name in (call, "*"):
+            if (key := (name, self._count[name], done)) in self._failures:
+                error = self._failures.pop(key)
+                if error is not None:
+                    raise error
+                self.alive = False
 
     def reach(self, call: str, handle: Any) -> None:
         if not self.note(call, handle):
+            self.missed += 1
             raise RuntimeError(
                 "time-out of 200ms while waiting for the simulator, make sure the simulator is ready and connected to "
                 f"localhost:{self.port}"
@@ -265,12 +267,12 @@ class Server:
         if callback is None:
             return
 
-        before = self._threads.get(sensor.id)
+        before, due = self._threads.get(sensor.id), time.monotonic() + delay
 
         def run() -> None:
             if before is not None:
                 before.join()  # a sensor's data come in order
-            time.sleep(delay)
+            time.sleep(max(0.0, due - time.monotonic()))
             try:
                 callback(data)
             except Exception:  # the client prints it and goes on

@@ -55,6 +55,7 @@ def posted(method: Callable[Concatenate[Any, P], None]) -> Callable[Concatenate[
     def call(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> None:
         if self._server.note(method.__qualname__, self):
             method(self, *args, **kwargs)
+        self._server.answered(method.__qualname__)
 
     return call
 

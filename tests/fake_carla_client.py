@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import fnmatch
+import functools
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, Concatenate
 
 import carla
 import numpy as np
-from fake_carla_actors import Actor, posted, remote
+from fake_carla_actors import Actor, P, posted, remote
 from fake_carla_data import ActorBlueprint, BlueprintLibrary, expect
 
 if TYPE_CHECKING:
@@ -225,6 +226,24 @@ class ActorList:
         return self._actors[pos]
 
 
+def managed(method: Callable[Concatenate[TrafficManager, P], None]) -> Callable[Concatenate[TrafficManager, P], None]:
+    """A call to a traffic manager: ends the process if its server is gone, which its user may have noticed before."""
+
+    @functools.wraps(method)
+    def call(self: TrafficManager, /, *args: P.args, **kwargs: P.kwargs) -> None:
+        server = self._server
+        if not self._usable:
+            raise RuntimeError("the traffic manager was shut down")
+        known = server.missed > 0 or self._life != server.life
+        if not server.note(method.__qualname__, self):
+            server.violations += [f"{method.__qualname__} without a server: the process would abort"] * known
+            raise RuntimeError("time-out of 200ms while waiting for the simulator")
+        method(self, *args, **kwargs)
+        server.answered(method.__qualname__)
+
+    return call
+
+
 class TrafficManager:
     """Lives in the client's process; its threads end the process when they find that their server is gone."""
 
@@ -235,12 +254,6 @@ class TrafficManager:
         self._rng = np.random.default_rng()  # without a seed no two runs are the same
         self._speeds: dict[int, float] = {}
 
-    def _use(self, call: str) -> None:
-        if not self._usable:
-            raise RuntimeError("the traffic manager was shut down")
-        if not self._server.note(f"TrafficManager.{call}", self):
-            self._server.violations.append(f"TrafficManager.{call} without a server: the process would abort")
-
     def _draw(self) -> float:
         """How a vehicle deviates from the speed that it is told, as traffic managers' vehicles do."""
         return float(self._rng.uniform(0.95, 1.05))
@@ -248,29 +261,29 @@ class TrafficManager:
     def get_port(self) -> int:
         return self._port
 
+    @managed
     def set_synchronous_mode(self, mode_switch: bool) -> None:
         expect(mode_switch, bool)
-        self._use("set_synchronous_mode")
         self._synchronous = mode_switch
 
+    @managed
     def set_random_device_seed(self, value: int) -> None:
         expect(value, int)
         if not 0 <= value < 2**64:
             raise OverflowError(f"seed {value}")
-        self._use("set_random_device_seed")
         self._seed, self._rng = value, np.random.default_rng(value)
 
+    @managed
     def set_desired_speed(self, actor: Actor, speed: float) -> None:
         expect(actor, Actor)
         expect(speed, float)
-        self._use("set_desired_speed")
         self._speeds[actor.id] = speed
 
+    @managed
     def auto_lane_change(self, actor: Actor, enable: bool) -> None:
         expect(actor, Actor)
         expect(enable, bool)
-        self._use("auto_lane_change")
 
+    @managed
     def shut_down(self) -> None:
-        self._use("shut_down")
         self._usable = False

@@ -372,12 +372,17 @@ def test_a_server_dies_and_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
     server = Server()
     world = start(monkeypatch, server)
     ego = put(world)
+    carla.Client("localhost", 2000).get_trafficmanager(8000)
     server.die("World.tick", after=1)
     world.tick()
     for _ in range(2):
         with pytest.raises(RuntimeError, match=r"time-out of \d+ms while waiting for the simulator"):
             world.tick()
     ego.apply_control(carla.VehicleControl())  # does not wait for an answer
+    manager = server.traffic_managers[8000]
+    with pytest.raises(RuntimeError, match="time-out"):
+        manager.set_synchronous_mode(False)
+    assert "the process would abort" in server.violations[0]
     server.restart()
     for call in (world.tick, ego.destroy):
         with pytest.raises(RuntimeError, match="time-out"):
