@@ -352,8 +352,9 @@ for k in range(25):
     events = np.zeros(30, EVENT_DTYPE)
     events["t"], events["p"], events["x"] = 0.001 * k, 1, k % 4
     writer.append(events)
-    if k == 12 and sys.argv[2] == "flush":
+    if k in (3, 12):
         writer.flush()
+    if k == 12 and sys.argv[2] == "flush":
         break
 os.kill(os.getpid(), signal.SIGKILL)
 """

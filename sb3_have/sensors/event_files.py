@@ -117,7 +117,7 @@ class EventFile:
                 f"t of {self.group!r} in {self.path} starts at {self._time(0)} s; shift it to start at 0 or later"
             )
         elif (offset := _lookup(places, "t_offset")) is not None:
-            self.t_offset = int(offset[()]) / 1e6
+            self.t_offset = int(np.asarray(offset[()]).item()) / 1e6
 
         resolution = _lookup(places[:1], "calib/resolution")
         stored = (None, None) if resolution is None else (int(resolution[1]), int(resolution[0]))
@@ -279,8 +279,9 @@ def read_events(
 
 
 def load_h5py() -> Any:
+    """The module h5py, with the compression filters of hdf5plugin registered."""
     try:
-        import_module("hdf5plugin")  # registers the compression filters
+        import_module("hdf5plugin")
         return import_module("h5py")
     except ImportError as error:
         raise ImportError(f'event files need h5py and hdf5plugin: pip install "sb3_have[events]" ({error})') from error

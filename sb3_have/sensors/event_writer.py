@@ -137,8 +137,9 @@ class EventWriter:
         self._last = int(ticks[-1])
         if sum(map(len, self._pending)) >= CHUNK:
             rows = np.concatenate(self._pending)
-            # Whole chunks only: a chunk that is extended is compressed and stored anew.
-            whole = len(rows) // CHUNK * CHUNK
+            # Up to the end of a chunk: one that is extended later is compressed and stored anew.
+            stored = len(self._columns["t"])
+            whole = (stored + len(rows)) // CHUNK * CHUNK - stored
             self._pending = [rows[whole:]]
             self._write(rows[:whole])
 
