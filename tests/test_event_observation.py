@@ -197,49 +197,47 @@ def test_known_environments(env_id: str, dt: float) -> None:
 
 
 class Recorder:
-    """What highway-env knows of a ``RecordVideo``."""
+    """What highway-env takes for gymnasium's ``RecordVideo``: keeps the frames of every step."""
 
-    frames_per_sec = 0
-    captured = 0
+    def __init__(self, env: Any) -> None:
+        self.env = env
+        self.frames_per_sec = 0
+        self.frames: list[list[Any]] = []
 
     def _capture_frame(self) -> None:
-        self.captured += 1
+        self.frames[-1].append(grey(self.env.render()))
+
+
+def top_view() -> Any:
+    config = {"simulation_frequency": 6, "vehicles_count": 8, "screen_width": 200, "screen_height": 60}
+    return gym.make("highway-v0", render_mode="rgb_array", config=config)
+
+
+def recorded(env: Any) -> tuple[list[Any], list[list[Any]]]:
+    """Observations and frames of a reset and three steps."""
+    observations = [env.reset(seed=1)[0]]
+    recorder = Recorder(env)
+    env.unwrapped.set_record_video_wrapper(recorder)
+    recorder.frames.append([grey(env.render())])
+    for _ in range(3):
+        recorder.frames.append([])
+        observations.append(env.step(1)[0])
+        recorder._capture_frame()
+    assert env.unwrapped._record_video_wrapper is recorder
+    env.close()
+    return observations, recorder.frames
 
 
 def test_highway_env_gives_a_frame_for_every_simulation_step() -> None:
-    def make() -> Any:
-        return gym.make(
-            "highway-v0", render_mode="rgb_array", config={"simulation_frequency": 6, "policy_frequency": 1}
-        )
-
-    frames = {"between": [[]], "only_last": [[]]}  # type: dict[str, list[list[Any]]]
-    plain = make()
-    plain.reset(seed=1)
-    recorder = Recorder()
-    recorder._capture_frame = lambda: frames["between"][-1].append(grey(plain.unwrapped.render()))  # type: ignore[method-assign]
-    for step in range(4):
-        if step:
-            plain.step(1)
-        else:
-            plain.unwrapped.set_record_video_wrapper(recorder)
-        last = grey(plain.render())
-        frames["only_last"][-1].append(last)
-        frames["between"][-1].append(last)
-        for kind in frames.values():
-            kind.append([])
-    plain.close()
-    assert [len(step) for step in frames["between"]] == [1, 6, 6, 6, 0]
-
-    env = EventObservation(make(), camera={"seed": 0, **QUIET})
-    recorder = Recorder()
-    env.unwrapped.set_record_video_wrapper(recorder)  # type: ignore[attr-defined]
-    observations = [env.reset(seed=1)[0], *(env.step(1)[0] for _ in range(3))]
-    assert recorder.captured == 15  # it got its frames all the same, and is in its place again
-    assert env.unwrapped._record_video_wrapper is recorder  # type: ignore[attr-defined]
-    env.close()
-    camera = EventCamera(150, 600, mapping="lin_log")
-    same(by_hand(camera, frames["between"][:-1], 1.0), observations)
-    coarse = by_hand(camera, frames["only_last"][:-1], 1.0)
+    frames = recorded(top_view())[1]
+    assert [len(step) for step in frames] == [1, 6, 6, 6]
+    observations, seen = recorded(EventObservation(top_view(), camera=QUIET))
+    # A recording outside of the wrapper has its frames all the same.
+    for step, same_step in zip(frames, seen, strict=True):
+        np.testing.assert_array_equal(step, same_step)
+    camera = EventCamera(60, 200, mapping="lin_log")
+    same(by_hand(camera, frames, 1.0), observations)
+    coarse = by_hand(camera, [step[-1:] for step in frames], 1.0)
     assert any((a != b["event"]).any() for a, b in zip(coarse, observations, strict=True))
 
 

@@ -180,7 +180,7 @@ def test_depth_of_a_known_scene(tmp_path: Path, extent: float, camera: str | Non
             )
 
         def reset_model(self) -> Any:
-            self.set_state(self.init_qpos, self.init_qvel)
+            self.set_state(self.init_qpos, self.init_qvel)  # type: ignore[no-untyped-call]
             return np.zeros(1, np.float32)
 
     env = DepthObservation(Boxes(), encoding="clipped", maximum=25.4)

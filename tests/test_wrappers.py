@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env as gymnasium_check_env
-from gymnasium.wrappers import RenderCollection
+from gymnasium.wrappers import RenderCollection, RepeatAction
 from moving_bar import HEIGHT, WIDTH, MovingBar, episode, frame_now, picture
 from stable_baselines3 import SAC
 from stable_baselines3.common.env_checker import check_env as sb3_check_env
@@ -183,6 +183,8 @@ def test_render_observation() -> None:
         np.testing.assert_array_equal(observation["rgb"], wanted)
     collected = RenderObservation(RenderCollection(MovingBar("rgb_array")))
     np.testing.assert_array_equal(episode(collected, 3)[-1]["rgb"], picture(3))
+    repeated = RenderObservation(RepeatAction(RenderCollection(MovingBar("rgb_array")), 2))
+    np.testing.assert_array_equal(episode(repeated, 3)[-1]["rgb"], picture(6))
 
 
 def test_dict_observation() -> None:

@@ -173,8 +173,10 @@ class EventObservation(SensorWrapper):
             )
         if frame.dtype.kind == "f":
             return resize(frame.astype(np.float64), self.image_size)
-        grey = cv2.transform(frame.astype(np.float64), LUMA) if frame.ndim == 3 and frame.shape[2] == 3 else frame
-        grey = resize(grey.reshape(frame.shape[:2]).astype(np.float64), self.image_size)
+        grey = frame.astype(np.float64)
+        if frame.ndim == 3 and frame.shape[2] == 3:
+            grey = cv2.transform(grey, LUMA)
+        grey = resize(grey.reshape(frame.shape[:2]), self.image_size)
         return grey / 255 if self.camera.mapping == "log" else grey
 
     def _duration(self, frames: int) -> float:
