@@ -236,8 +236,12 @@ def test_vectors_fail_in_units_of_their_range() -> None:
     for severity, count in ((1, 2), (2, 4), (3, 8)):
         assert (corrupt("dead_pixels", "vector", severity) != example("vector")).sum() == count
     huge = np.finfo(np.float32).max  # "no bound" of older environments
-    lone = f.vector_noise(np.zeros(9, np.float32), rng, np.full(9, -huge), np.full(9, huge), 0.1)
-    assert 0 < np.abs(lone).max() < 1
+    for least, most in ((-huge, huge), (-huge, 1.0), (-1.0, huge), (3.0, np.inf), (-np.inf, -3.0)):
+        start = np.full(2000, np.clip(0, least, most), np.float32)
+        bounds = np.full(2000, least, np.float32), np.full(2000, most, np.float32)
+        assert 0.2 < np.abs(f.vector_noise(start, rng, *bounds, 0.1) - start).max() < 0.6
+        entries = f.stick_entries(start, rng, *bounds, 1.0)
+        assert entries.min() >= least and entries.max() <= most and np.abs(entries - start).max() <= 0.5
 
 
 def test_the_table_is_complete() -> None:

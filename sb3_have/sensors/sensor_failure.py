@@ -140,7 +140,7 @@ class SensorFailure(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         observation, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._seed(seed)
-        self._step, self._active = 0, False
+        self._step = 0
         self._past.clear()
         return self._fail(observation, info)
 
