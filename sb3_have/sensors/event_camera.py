@@ -82,8 +82,8 @@ class EventCamera:
         order, time constant 1 / (2 pi cutoff_hz), exact for an input that is linear in time between the frames. None
         is an unlimited bandwidth.
     :param cutoff_intensity: Intensity from which on the bandwidth is ``cutoff_hz``. In less light it shrinks in
-        proportion, to no less than a tenth, much as in v2e. The intensity is the new frame's, so how finely a film is cut
-        into frames then makes a small difference. None: the same bandwidth in any light.
+        proportion, to no less than a tenth, much as in v2e. The intensity is the new frame's, so how finely a film is
+        cut into frames then makes a small difference. None: the same bandwidth in any light.
     :param seed: Seed of the threshold mismatch, the leak phases and the noise.
     :raises ValueError: on a parameter out of its range.
     """
@@ -299,15 +299,15 @@ class EventCamera:
         """Drop the events that fall into their pixel's dead time; only an event that is kept starts a new one."""
         order = _by_pixel(pixel, times)
         pixel, times, polarity = pixel[order], times[order], polarity[order]
-        first = np.flatnonzero(np.diff(pixel, prepend=-1))
-        rank = np.arange(len(pixel)) - np.repeat(first, np.diff(np.append(first, len(pixel))))
-        # The first event of every pixel, the second of those that have one, and so on: each event is visited once.
-        rounds = np.split(np.argsort(rank, kind="stable"), np.cumsum(np.bincount(rank)))
+        another = np.diff(pixel, append=-1) == 0  # follows in the same pixel
         keep = np.zeros(len(pixel), dtype=bool)
-        for nth_event in rounds:
-            alive = nth_event[times[nth_event] - self._last_event[pixel[nth_event]] >= self.refractory]
+        # The first event of every pixel, the second of those that have one, and so on: each is visited once.
+        nth = np.flatnonzero(np.diff(pixel, prepend=-1))
+        while len(nth):
+            alive = nth[times[nth] - self._last_event[pixel[nth]] >= self.refractory]
             keep[alive] = True
             self._last_event[pixel[alive]] = times[alive]
+            nth = nth[another[nth]] + 1
         return pixel[keep], times[keep], polarity[keep]
 
 
@@ -322,9 +322,11 @@ def _by_time(times: FloatArray) -> IntArray:
 def _by_pixel(pixel: IntArray, times: FloatArray) -> IntArray:
     """``np.lexsort((times, pixel))``, faster where the events of most pixels are in order already: crossings are."""
     order = np.argsort(pixel, kind="stable")
-    late = (np.diff(times[order]) < 0) & (np.diff(pixel[order]) == 0)
+    pixel, times = pixel[order], times[order]
+    late = (np.diff(times) < 0) & (np.diff(pixel) == 0)
     if late.any():
-        mixed = np.flatnonzero(np.isin(pixel[order], pixel[order][1:][late]))
-        part = order[mixed]
-        order[mixed] = part[np.lexsort((times[part], pixel[part]))]
+        disordered = np.zeros(pixel[-1] + 1, dtype=bool)
+        disordered[pixel[1:][late]] = True
+        part = np.flatnonzero(disordered[pixel])
+        order[part] = order[part][np.lexsort((times[part], pixel[part]))]
     return order
