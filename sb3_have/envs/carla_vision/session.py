@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Final, cast
 
@@ -65,9 +65,9 @@ class Session:
         #: All actors of this session bear it as their role, so that none is overlooked.
         self.role = ROLE + uuid.uuid4().hex
         self._actors: list[carla.Actor] = []
-        self._spawning = False
-        self._closed = False
-        self._undo = ExitStack()
+        self._spawning = self._connected = self._closing = False
+        #: What puts things right, in the order of the things done; each step may be taken again.
+        self._undo: list[Callable[[], object]] = []
 
     def connect(self) -> None:
         """
@@ -85,6 +85,7 @@ class Session:
         except RuntimeError as error:
             self.lost = True
             raise self.connection_error("no CARLA server at") from error
+        self._connected = True
         ours = self.client.get_client_version()
         if ours != theirs:
             gym.logger.warn(
@@ -103,15 +104,14 @@ class Session:
         settings = self.world.get_settings()
         settings.synchronous_mode, settings.fixed_delta_seconds = True, server.tick
         settings.no_rendering_mode = False
-        # Undone in the reverse order: each is noted before it is done, so that an interrupt between cannot hide it.
-        self._undo.callback(self._drop_traffic_manager)
-        self._undo.callback(lambda: self.world.apply_settings(original))
-        self._undo.callback(lambda: self.world.set_weather(weather))
+        # Each step is noted before there is something to undo, so that an interrupt between cannot hide it.
+        self._undo.append(lambda: self.world.apply_settings(original))
+        self._undo.append(lambda: self.world.set_weather(weather))
         self.world.apply_settings(settings)
         self.tm_port = server.tm_port
         if server.traffic:
             self._start_traffic_manager()
-        self._undo.callback(self.destroy_actors)
+        self._undo.append(self.destroy_actors)
         if abandoned:
             self._find_actors(ROLE)  # whoever died may have left some behind
         self.blueprints = self.world.get_blueprint_library()
@@ -132,20 +132,23 @@ class Session:
     def _start_traffic_manager(self) -> None:
         while self.tm_port in _dead_ports:
             self.tm_port += 1
+        self._undo.append(self._stop_traffic_manager)
         try:
             self.traffic_manager = self.client.get_trafficmanager(self.tm_port)
         except RuntimeError as error:
+            self._undo.pop()
             raise RuntimeError(
                 f"no traffic manager on port {self.tm_port}: {error}. If the port is taken, choose another `tm_port`"
             ) from error
-        self._undo.callback(self.traffic_manager.set_synchronous_mode, False)
         self.traffic_manager.set_synchronous_mode(True)
 
-    def _drop_traffic_manager(self) -> None:
-        # It would go on polling the server, and abort the process when that is shut down.
-        if self.traffic_manager is not None:
-            self.traffic_manager.shut_down()
-            self.traffic_manager = None
+    def _stop_traffic_manager(self) -> None:
+        # If it ran on it would poll the server, and abort this process when that is shut down. An interrupt right after
+        # it was started leaves us without a handle; asking for the port again gives one.
+        manager = self.traffic_manager or self.client.get_trafficmanager(self.tm_port)
+        manager.set_synchronous_mode(False)
+        manager.shut_down()
+        self.traffic_manager = None
 
     # ---- actors ----
 
@@ -183,11 +186,10 @@ class Session:
             self._find_actors(self.role)
             self._spawning = False
         self._actors.sort(key=lambda actor: not actor.type_id.startswith("sensor."))  # these first
-        for actor in self._actors:
-            if actor.type_id.startswith("sensor."):
-                sensor = cast(carla.Sensor, actor)
-                if sensor.is_listening():
-                    sensor.stop()
+        for actor in 2 * self._actors:  # one error is no reason to leave a sensor streaming
+            with suppress(RuntimeError):
+                if actor.type_id.startswith("sensor.") and cast(carla.Sensor, actor).is_listening():
+                    cast(carla.Sensor, actor).stop()
         if self._actors:
             destroy = [carla.command.DestroyActor(actor.id) for actor in self._actors]
             failures = [reply.error for reply in self.client.apply_batch_sync(destroy, False) if reply.has_error()]
@@ -220,31 +222,51 @@ class Session:
 
     def close(self) -> None:
         """
-        Remove the actors, restore the settings of the server. Calling it again does nothing.
+        Remove the actors, restore the settings of the server. Calling it again finishes what was interrupted.
 
         A server that has gone is left alone: each call would wait for its time-out, and a traffic manager that cannot
         reach its server aborts the whole process.
+
+        :raises BaseException: an interrupt, after the other steps.
         """
-        if self._closed:
-            return
-        if not self.lost and hasattr(self, "world"):
-            self.lost = not self._alive()
-        if self.lost:
-            self._undo.pop_all()
-            self._actors.clear()
-            if self.traffic_manager is not None:
-                _dead_ports.add(self.tm_port)
-                self.traffic_manager = None
+        self._closing = True
+        if self._connected and not self._alive():
+            self._give_up()
+        interrupt: BaseException | None = None
+        for step in reversed(self._undo.copy()):
+            try:
+                if not self.lost:
+                    self._take(step)
+            except BaseException as error:
+                interrupt = interrupt or error
+            else:
+                self._undo = [other for other in self._undo if other is not step]
+        if interrupt is not None:
+            raise interrupt
+        self._connected = False
+
+    def _take(self, step: Callable[[], object]) -> None:
         try:
-            self._undo.close()
-        except RuntimeError as error:
-            gym.logger.warn(f"cleaning up the CARLA server {self.server.host}:{self.server.port} failed: {error}")
-        self._closed = True
+            step()
+        except RuntimeError:
+            if not self._alive():
+                self._give_up()
+                return
+            try:
+                step()
+            except RuntimeError as error:
+                gym.logger.warn(f"cleaning up the CARLA server {self.server.host}:{self.server.port} failed: {error}")
+
+    def _give_up(self) -> None:
+        self.lost = True
+        if self._stop_traffic_manager in self._undo:
+            _dead_ports.add(self.tm_port)
+        self._undo.clear()
 
     def usable(self) -> bool:
         """Whether the server is there, its world is the one connected to, and it still waits for our ticks."""
         try:
-            return self._alive() and self.world.get_settings().synchronous_mode
+            return not self._closing and self._alive() and self.world.get_settings().synchronous_mode
         except RuntimeError:
             return False  # another world has been loaded
 
