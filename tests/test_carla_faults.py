@@ -1,0 +1,483 @@
+"""CarlaVision-v0 when the server, a sensor or the user interrupts: the right error, and nothing left behind."""
+
+import gc
+import subprocess
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+carla = pytest.importorskip("carla", reason="needs the client module of CARLA: pip install 'sb3_have[carla]'")
+
+import fake_carla_fixtures  # noqa: E402
+from fake_carla import Server, install  # noqa: E402
+from fake_carla_fixtures import fresh  # noqa: E402
+
+from sb3_have.envs.carla_vision import CarlaConnectionError, CarlaVisionEnv  # noqa: E402
+
+server = fake_carla_fixtures.server
+
+FULL = np.array([1.0, 0.0], dtype=np.float32)
+SMALL: dict[str, Any] = {"image_size": 16, "vehicles_count": 2, "timeout": 0.1, "initial_speed": 10.0}
+RGB, DEPTH, DVS = (f"sensor.camera.{name}" for name in ("rgb", "depth", "dvs"))
+
+
+@pytest.fixture
+def env(server: Server) -> Iterator[CarlaVisionEnv]:
+    made = CarlaVisionEnv(**SMALL)
+    yield made
+    made.close()
+    assert server.left_behind() == []
+
+
+def works(server: Server, env: CarlaVisionEnv) -> None:
+    """A new episode runs to its end, and nothing is left after it."""
+    server.heal()
+    observation, info = env.reset(seed=1)
+    assert env.observation_space.contains(observation) and info["distance"] == 0
+    assert env.step(FULL)[4]["distance"] > 0
+    env.close()
+    assert server.left_behind() == []
+
+
+# ---- at every call that the client makes ----
+
+
+def drive(env: CarlaVisionEnv) -> None:
+    env.reset(seed=0)
+    env.step(FULL)
+    env.reset()
+    env.step(FULL)
+
+
+def calls_of_a_drive(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Positions of the calls of :func:`drive`: the first and the last of each kind before and after the first step."""
+    server = fresh(monkeypatch)
+    env = CarlaVisionEnv(**{**SMALL, "vehicles_count": 1, "modalities": ("depth",)})
+    env.reset(seed=0)
+    env.step(FULL)
+    half = len(server.calls)
+    env.reset()
+    env.step(FULL)
+    calls = list(server.calls)
+    env.close()
+    assert server.left_behind() == []
+    kinds = [(call, position < half) for position, call in enumerate(calls)]
+    first_and_last = {kinds.index(kind) for kind in kinds} | {
+        len(kinds) - 1 - kinds[::-1].index(kind) for kind in kinds
+    }
+    assert {call for call, _ in kinds} >= {
+        "Client.get_world",
+        "Client.get_trafficmanager",
+        "Client.apply_batch_sync",
+        "World.apply_settings",
+        "World.get_map",
+        "World.set_weather",
+        "World.tick",
+        "World.try_spawn_actor",
+        "Sensor.listen",
+        "Sensor.stop",
+        "Vehicle.apply_control",
+        "Vehicle.set_autopilot",
+        "TrafficManager.set_random_device_seed",
+        "TrafficManager.set_synchronous_mode",
+    }
+    return sorted(first_and_last)
+
+
+#: Whose failure between two episodes makes the client connect anew, or does not matter.
+TOLERATED = ("Client.set_timeout", "Client.get_server_version", "World.get_settings", "Sensor.stop")
+
+
+def trials(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[int, Server, CarlaVisionEnv]]:
+    for position in calls_of_a_drive(monkeypatch):
+        server = fresh(monkeypatch)
+        yield position, server, CarlaVisionEnv(**{**SMALL, "vehicles_count": 1, "modalities": ("depth",)})
+
+
+@pytest.mark.parametrize("done", [False, True], ids=["before", "after"])
+def test_ctrl_c_at_any_call_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch, done: bool) -> None:
+    for position, server, env in trials(monkeypatch):
+        server.fail("*", KeyboardInterrupt(), after=position, done=done)
+        with pytest.raises(KeyboardInterrupt):
+            drive(env)
+        assert server.left_behind() == [], server.calls[position]
+        with pytest.raises(gym.error.ResetNeeded):
+            env.step(FULL)
+        works(server, env)
+
+
+def test_an_error_at_any_call_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+    for position, server, env in trials(monkeypatch):
+        server.fail("*", RuntimeError("rpc::rpc_error during call"), after=position)
+        try:
+            drive(env)
+            env.close()
+            assert server.calls[position] in TOLERATED
+        except (RuntimeError, CarlaConnectionError) as error:
+            assert any("rpc::rpc_error" in str(cause) for cause in (error, error.__cause__)), server.calls[position]
+        assert server.left_behind() == [], server.calls[position]
+        works(server, env)
+
+
+def test_a_server_may_die_at_any_call(monkeypatch: pytest.MonkeyPatch) -> None:
+    for position, server, env in trials(monkeypatch):
+        server.die("*", after=position)
+        with pytest.raises(CarlaConnectionError, match=r"localhost:2000.*CarlaUE4.sh.*2000") as caught:
+            drive(env)
+        assert "time-out" in str(caught.value.__cause__)
+        assert server.missed <= 3, "each call to a server that is gone waits for the time-out"
+        env.close()
+        assert server.missed <= 3
+        with pytest.raises(gym.error.ResetNeeded):
+            env.step(FULL)
+        server.restart()
+        works(server, env)
+
+
+CLEAN_UP = {
+    "Sensor.stop": "",
+    "Client.apply_batch_sync": "lives",
+    "TrafficManager.set_synchronous_mode": "traffic manager",
+    "TrafficManager.shut_down": "traffic manager",
+    "World.set_weather": "",
+    "World.apply_settings": "_mode is True fixed_delta_seconds is",
+}
+
+
+@pytest.mark.parametrize("call", CLEAN_UP)
+def test_an_error_while_cleaning_up_is_made_good(server: Server, env: CarlaVisionEnv, call: str) -> None:
+    env.reset()
+    server.fail(call, RuntimeError("out of order"))
+    env.close()
+    assert server.left_behind() == []
+
+
+@pytest.mark.parametrize("call", CLEAN_UP)
+def test_what_cannot_be_cleaned_up_does_not_stop_the_rest(monkeypatch: pytest.MonkeyPatch, call: str) -> None:
+    server = fresh(monkeypatch)
+    env = CarlaVisionEnv(**SMALL)
+    env.reset()
+    for attempt in range(8):
+        server.fail(call, RuntimeError("out of order"), after=attempt)
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        env.close()
+    expected = CLEAN_UP[call].split()
+    for line in server.left_behind():
+        assert any(word in line for word in expected) or (call == "Sensor.stop" and "while it was listening" in line)
+    assert call == "Sensor.stop" or "out of order" in str(told[-1].message)
+    assert not server.actors or call == "Client.apply_batch_sync"
+
+
+@pytest.mark.parametrize("call", ["Sensor.stop", "Client.apply_batch_sync", "World.apply_settings"])
+@pytest.mark.parametrize("done", [False, True], ids=["before", "after"])
+def test_ctrl_c_while_closing_does_not_stop_the_rest(
+    server: Server, env: CarlaVisionEnv, call: str, done: bool
+) -> None:
+    env.reset()
+    server.fail(call, KeyboardInterrupt(), done=done)
+    with pytest.raises(KeyboardInterrupt):
+        env.close()
+    env.close()
+    assert server.left_behind() == []
+
+
+# ---- the server ----
+
+
+def test_no_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    install(monkeypatch)
+    for options in ({}, {"port": 2345}, {"host": "example"}):
+        env = CarlaVisionEnv(**SMALL, **options)
+        where = f"{options.get('host', 'localhost')}:{options.get('port', 2000)}"
+        with pytest.raises(CarlaConnectionError, match=rf"no CARLA server at {where}.*-carla-rpc-port"):
+            env.reset()
+        env.close()
+
+
+def test_no_server_for_the_real_client_either() -> None:
+    env = CarlaVisionEnv(**SMALL, port=2957)
+    with pytest.raises(CarlaConnectionError, match="no CARLA server at localhost:2957"):
+        env.reset()
+
+
+def test_a_server_that_was_restarted_between_episodes(server: Server, env: CarlaVisionEnv) -> None:
+    env.reset(seed=0)
+    server.restart()
+    works(server, env)
+    env.reset()
+    server.restart("Town01")
+    works(server, env)
+    assert server.map.name.endswith("Town04")
+
+
+def test_a_server_that_was_restarted_during_an_episode(server: Server, env: CarlaVisionEnv) -> None:
+    env.reset(seed=0)
+    env.step(FULL)
+    server.restart()
+    with pytest.raises(CarlaConnectionError, match="lost the CARLA server"):
+        env.step(FULL)
+    works(server, env)
+
+
+def test_another_world_was_loaded_between_episodes(server: Server, env: CarlaVisionEnv) -> None:
+    env.reset()
+    carla.Client("localhost", 2000).load_world("Town01")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        works(server, env)
+
+
+def test_another_town_is_loaded_and_an_unknown_one_refused(server: Server) -> None:
+    env = CarlaVisionEnv(**SMALL, town="Town01")
+    with pytest.raises(ValueError, match=r"no lane .* on road 45"):
+        env.reset()
+    assert server.left_behind() == []
+    env = CarlaVisionEnv(**SMALL, town="Town01", road_id=7)
+    with pytest.raises(ValueError, match="s = "):  # that road is too short for the traffic
+        while True:
+            env.reset()
+    assert server.left_behind() == []
+    env = CarlaVisionEnv(**SMALL)
+    env.reset()
+    assert server.map.name == "Carla/Maps/Town04"
+    assert server.calls.count("Client.load_world") == 2
+    env.reset()
+    env.close()
+    assert server.calls.count("Client.load_world") == 2
+    env = CarlaVisionEnv(**SMALL, town="Town99")
+    with pytest.raises(ValueError, match=r"Town99.*Town01, Town04"):
+        env.reset()
+    assert server.left_behind() == []
+
+
+def test_a_world_that_a_crashed_client_left_synchronous(server: Server, env: CarlaVisionEnv) -> None:
+    crashed = CarlaVisionEnv(**SMALL)
+    crashed.reset()
+    crashed._finalizer.detach()
+    crashed._session = None
+    server.traffic_managers.clear()  # died with its process
+    with pytest.warns(UserWarning, match="synchronous mode already"):
+        env.reset()
+    assert len(server.vehicles()) == 3
+    env.close()
+    assert server.left_behind() == []
+
+
+def test_settings_and_weather_are_as_before(server: Server) -> None:
+    server.settings.max_culling_distance = 123.0
+    server.settings.no_rendering_mode = True
+    server.settings.fixed_delta_seconds = 0.1
+    server.weather = weather = carla.WeatherParameters.MidRainyNoon
+    env = CarlaVisionEnv(**SMALL, weather="ClearNight")
+    env.reset()
+    assert not server.settings.no_rendering_mode and server.settings.max_culling_distance == 123
+    env.close()
+    assert not server.settings.synchronous_mode and server.settings.fixed_delta_seconds == pytest.approx(0.1)
+    assert server.settings.no_rendering_mode and server.weather == weather
+
+
+def test_other_versions_are_told(server: Server, env: CarlaVisionEnv) -> None:
+    server.version = "0.9.13"
+    with pytest.warns(UserWarning, match=r"0\.9\.16.*0\.9\.13"):
+        env.reset()
+
+
+def test_a_taken_port_of_the_traffic_manager(server: Server, env: CarlaVisionEnv) -> None:
+    server.fail("Client.get_trafficmanager", RuntimeError("bind error"))
+    with pytest.raises(RuntimeError, match="tm_port"):
+        env.reset()
+    assert server.left_behind() == []
+    works(server, env)
+
+
+# ---- spawning ----
+
+
+def test_spawn_collisions_are_tried_again(server: Server, env: CarlaVisionEnv) -> None:
+    server.block(10)
+    env.reset()
+    assert len(server.vehicles()) == 3
+
+
+@pytest.mark.parametrize("vehicles", [0, 1])
+def test_no_room(server: Server, env: CarlaVisionEnv, vehicles: int) -> None:
+    env.reset()
+    env.close()
+    if vehicles:
+        spawn, free = server.spawn, iter([True])
+        server.spawn = lambda *args: spawn(*args) if next(free, False) else None  # type: ignore[method-assign]
+    else:
+        server.block(10**6)
+    with pytest.raises(RuntimeError, match=r"no room for (the ego|vehicle 1 of 2)"):
+        env.reset()
+    assert server.left_behind() == []
+    if vehicles:
+        server.spawn = spawn  # type: ignore[method-assign]
+    works(server, env)
+
+
+# ---- sensors ----
+
+
+def test_ticks_without_events(server: Server, env: CarlaVisionEnv) -> None:
+    env.reset(seed=0)
+    server.drop(DVS, 4)
+    assert (env.step(FULL)[0]["event"] == 128).all()
+    server.drop(DVS, 2)
+    first = server.frame + 1
+    event = env.step(FULL)[0]["event"]
+    sent = sum(len(server.sent[DVS][frame]) for frame in range(first + 2, first + 4))
+    assert (event[..., :2] == 128).all() and (event[..., 3:] != 128).any() and sent > 0
+
+
+def test_events_of_another_step_are_not_taken_for_this_one(server: Server, env: CarlaVisionEnv) -> None:
+    env.reset(seed=0)
+    server.late(DVS, 4)
+    assert (env.step(FULL)[0]["event"] == 128).all()
+    server.late(DVS, 0)
+    server.drop(DVS, 4)
+    assert (env.step(FULL)[0]["event"] == 128).all()
+
+
+@pytest.mark.parametrize("kind", [RGB, DEPTH])
+def test_an_image_that_is_late(server: Server, env: CarlaVisionEnv, kind: str) -> None:
+    env.reset(seed=0)
+    server.late(kind, 1)
+    name = kind.rsplit(".")[-1]
+    with pytest.raises(TimeoutError, match=rf"frame {server.frame + 4} from the {name} sensor within 0.1 s"):
+        env.step(FULL)
+    assert server.left_behind() == []
+    works(server, env)
+
+
+@pytest.mark.parametrize("kind", [RGB, DEPTH])
+def test_an_image_that_is_missing(server: Server, env: CarlaVisionEnv, kind: str) -> None:
+    server.drop(kind, 10**6)
+    with pytest.raises(TimeoutError, match=kind.rsplit(".")[-1]):
+        env.reset()
+    assert server.left_behind() == []
+    works(server, env)
+
+
+def test_one_missing_image_within_a_step_does_not_matter(server: Server, env: CarlaVisionEnv) -> None:
+    env.reset(seed=0)
+    server.drop(RGB, 3)
+    observation = env.step(FULL)[0]
+    np.testing.assert_array_equal(observation["rgb"], server.sent[RGB][server.frame][..., [2, 1, 0]])
+
+
+@pytest.mark.parametrize("kind", [RGB, DEPTH, DVS])
+def test_data_that_comes_a_little_after_the_tick(server: Server, env: CarlaVisionEnv, kind: str) -> None:
+    env.reset(seed=0)
+    server.slow(kind, 0.008 if kind == DVS else 0.03)
+    observation = env.step(FULL)[0]
+    server.join()
+    np.testing.assert_array_equal(observation["rgb"], server.sent[RGB][server.frame][..., [2, 1, 0]])
+    assert (observation["event"] != 128).any()
+
+
+@pytest.mark.parametrize(("by", "error"), [(1, RuntimeError), (-1, TimeoutError)])
+@pytest.mark.parametrize("kind", [RGB, DEPTH])
+def test_wrong_frame_numbers(server: Server, env: CarlaVisionEnv, kind: str, by: int, error: type[Exception]) -> None:
+    env.reset(seed=0)
+    server.misnumber(kind, by)
+    due = server.frame + 4
+    with pytest.raises(error, match=rf"{kind.rsplit('.')[-1]}.*{due}|{due}.*{kind.rsplit('.')[-1]}"):
+        if by > 0:  # the queue still holds the frame before
+            server.drop(kind, 3)
+        env.step(FULL)
+    assert server.left_behind() == []
+    works(server, env)
+
+
+@pytest.mark.parametrize("kind", [RGB, DEPTH, DVS])
+def test_an_exception_in_a_callback(
+    server: Server, env: CarlaVisionEnv, kind: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    env.reset(seed=0)
+    server.corrupt(kind)
+    name = "event" if kind == DVS else kind.rsplit(".")[-1]
+    with pytest.raises(RuntimeError, match=f"callback of the {name} sensor failed") as caught:
+        env.step(FULL)
+    assert isinstance(caught.value.__cause__, ValueError)
+    assert server.left_behind() == [] and not capsys.readouterr().err
+    works(server, env)
+
+
+def test_old_images_do_not_reach_the_next_episode(server: Server, env: CarlaVisionEnv) -> None:
+    server.slow(RGB, 0.02)
+    env.reset(seed=0)
+    for _ in range(2):
+        env.reset()
+        observation = env.step(FULL)[0]
+        server.join()
+        np.testing.assert_array_equal(observation["rgb"], server.sent[RGB][server.frame][..., [2, 1, 0]])
+
+
+# ---- the end ----
+
+
+def test_closing_at_any_time(server: Server, env: CarlaVisionEnv) -> None:
+    env.close()
+    assert server.calls == []
+    for close in (1, 2):
+        env.reset()
+        for _ in range(close):
+            env.close()
+        assert server.left_behind() == []
+        count = len(server.calls)
+        env.close()
+        assert len(server.calls) == count
+
+
+def test_sensors_are_stopped_before_they_are_destroyed(server: Server, env: CarlaVisionEnv) -> None:
+    env.reset()
+    env.reset()
+    assert len(server.sensors()) == 4 and len(server.vehicles()) == 3  # those of one episode
+    env.close()
+    assert server.calls.count("Sensor.stop") == 8 and server.violations == []
+
+
+def test_an_environment_that_is_forgotten(server: Server) -> None:
+    env = CarlaVisionEnv(**SMALL)
+    env.reset()
+    del env
+    gc.collect()
+    assert server.left_behind() == []
+
+
+PROGRAM = """
+import atexit, sys
+atexit.register(lambda: print(server.left_behind(), server.calls.count("World.tick") > 10))
+sys.modules["carla"] = None
+from sb3_have.envs.carla_vision import CarlaVisionEnv
+env = CarlaVisionEnv(image_size=16, vehicles_count=1, timeout=0.5)
+try:
+    env.reset()
+except ImportError as error:
+    print(error)
+del sys.modules["carla"]
+import pytest
+from fake_carla import Server, install
+server = Server()
+install(pytest.MonkeyPatch(), server)
+env.reset()
+env.step([1.0, 0.0])
+raise ValueError("a mistake")
+"""
+
+
+def test_a_program_without_a_client_and_without_an_end() -> None:
+    """Without the client there is advice; a mistake in the program leaves nothing on the server."""
+    folder = Path(__file__).parent
+    done = subprocess.run([sys.executable, "-c", PROGRAM], cwd=folder, capture_output=True, text=True, timeout=120)
+    advice, left = done.stdout.strip().splitlines()
+    assert "pip install 'sb3_have[carla]'" in advice and left == "[] True", done.stderr
+    assert done.stderr.strip().endswith("ValueError: a mistake")
