@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 from fake_carla import Server, install
 
@@ -11,6 +12,9 @@ from sb3_have.envs.carla_vision import CarlaVisionEnv, session
 SMALL: dict[str, Any] = {"image_size": 16, "vehicles_count": 3, "timeout": 0.5}
 #: No traffic, and the cheapest sensor.
 ALONE: dict[str, Any] = {**SMALL, "vehicles_count": 0, "modalities": ("depth",)}
+#: Time-outs that a test can wait for.
+BRIEF: dict[str, Any] = {**SMALL, "vehicles_count": 2, "timeout": 0.1, "initial_speed": 10.0}
+FULL = np.array([1.0, 0.0], dtype=np.float32)
 Start = Callable[..., CarlaVisionEnv]
 
 
@@ -46,3 +50,21 @@ def start(server: Server) -> Iterator[Start]:
 
     yield make
     close()
+
+
+@pytest.fixture
+def env(server: Server) -> Iterator[CarlaVisionEnv]:
+    made = CarlaVisionEnv(**BRIEF)
+    yield made
+    made.close()
+    assert server.left_behind() == []
+
+
+def works(server: Server, env: CarlaVisionEnv) -> None:
+    """A new episode runs to its end, and nothing is left after it."""
+    server.heal()
+    observation, info = env.reset(seed=1)
+    assert env.observation_space.contains(observation) and info["distance"] == 0
+    assert env.step(FULL)[4]["distance"] > 0
+    env.close()
+    assert server.left_behind() == []

@@ -158,6 +158,29 @@ def test_hitting_two_cars_at_once_is_one_colliding_tick(server: Server, start: S
     assert not env.step(STRAIGHT)[2] and env.step(STRAIGHT)[2]
 
 
+def test_collisions_that_are_reported_late_count_too(server: Server, start: Start) -> None:
+    env = start(**ALONE, standstill_time=None)
+    server.late("sensor.other.collision", 3)
+    server.collide(*[(0.0, 100.0, 0.0)] * 20)
+    steps = [env.step(STRAIGHT) for _ in range(6)]
+    assert [terminated for _, _, terminated, _, _ in steps] == [False] * 5 + [True]
+    assert sum(float(reward) for _, reward, *_ in steps) == pytest.approx(-0.001 * 20 * 100)
+
+
+def test_collisions_before_the_episode_do_not_count(server: Server, start: Start) -> None:
+    server.collide(*[(1.0, 0.0, 0.0)] * 10)  # while the cars fall onto the road
+    env = start(**ALONE, collision_ticks=1)
+    _, reward, terminated, *_ = env.step(STRAIGHT)
+    assert reward == 0 and not terminated
+
+
+def test_stepping_on_after_the_end_is_told(server: Server, start: Start) -> None:
+    env = start(**ALONE, max_episode_steps=1)
+    env.step(STRAIGHT)
+    with pytest.warns(UserWarning, match="after the end"):
+        env.step(STRAIGHT)
+
+
 def test_standing_still_ends_the_episode(server: Server, start: Start) -> None:
     env = start(**ALONE)
     for step in range(25):

@@ -1,6 +1,6 @@
 """CarlaVision-v0 on the fake server: the contract, what is seen, and who is where."""
 
-from typing import Any
+from typing import Any, get_args
 
 import gymnasium as gym
 import numpy as np
@@ -21,6 +21,7 @@ from sb3_have.envs import HighwayVisionEnv  # noqa: E402
 from sb3_have.envs.carla_vision import PAPER, CarlaVisionEnv  # noqa: E402
 from sb3_have.envs.weather import WEATHERS  # noqa: E402
 from sb3_have.sensors import encode_depth  # noqa: E402
+from sb3_have.sensors.representations import Representation  # noqa: E402
 
 server, start = fake_carla_fixtures.server, fake_carla_fixtures.start
 
@@ -94,6 +95,15 @@ def test_defaults_are_those_of_highway_vision(server: Server) -> None:
         "rgb": (128, 128, 3),
         "event": (128, 128, 5),
     }
+
+
+@pytest.mark.parametrize("representation", get_args(Representation))
+def test_representations_have_the_same_space_in_both(server: Server, start: Start, representation: str) -> None:
+    options = {"image_size": 16, "modalities": ("event",), "event": {"representation": representation, "bins": 3}}
+    env = start(**options, initial_speed=20.0)
+    assert env.observation_space == HighwayVisionEnv(**options).observation_space
+    observation, *_ = env.step(FULL)
+    assert env.observation_space.contains(observation) and len(np.unique(observation["event"])) > 2
 
 
 @pytest.mark.parametrize(
