@@ -44,7 +44,10 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
     Needs the package ``carla`` (extra ``carla``) and a running server, which it connects to at the first ``reset``. The
     server is put into synchronous mode and driven by this environment alone. ``close``, any exception out of ``reset``
     or ``step``, and the end of the program remove what was put there and restore the server's settings; the next
-    ``reset`` connects anew. The map is loaded only if the server has another one.
+    ``reset`` connects anew. The map is loaded only if the server has another one. A server may be restarted between
+    episodes; when it dies with traffic on it, CARLA's own traffic manager, a thread of this process, may abort the
+    process at the next tick, which Python cannot prevent (CARLA's issues 4577 and 6748): let something restart long
+    trainings.
 
     Observation, action and ``info`` are those of HighwayVision-v0
     (:class:`~sb3_have.envs.highway_vision.HighwayVisionEnv`), with ``end_reason`` "standstill" besides. The ego starts

@@ -146,9 +146,11 @@ class Session:
         # If it ran on it would poll the server, and abort this process when that is shut down. An interrupt right after
         # it was started leaves us without a handle; asking for the port again gives one.
         manager = self.traffic_manager or self.client.get_trafficmanager(self.tm_port)
-        manager.set_synchronous_mode(False)
-        manager.shut_down()
-        self.traffic_manager = None
+        try:
+            manager.set_synchronous_mode(False)
+        finally:
+            self.traffic_manager = None
+            manager.shut_down()
 
     # ---- actors ----
 
