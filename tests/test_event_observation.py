@@ -54,7 +54,7 @@ def same(wanted: list[Any], observations: list[Any], key: str = "event") -> None
     ids=["rgb_array", "rgbd_tuple", "key", "function", "list"],
 )
 def test_the_image_is_that_of_the_camera_used_by_hand(make: Callable[..., Env]) -> None:
-    options = {"threshold": (0.3, 0.25), "threshold_sigma": 0.02, "mapping": "log", "seed": 5}
+    options = {"threshold": (0.3, 0.25), "threshold_sigma": 0.02, "refractory": 0.03, "mapping": "log", "seed": 5}
     env = make(camera=options)
     observations = episode(env)
     assert env.observation_space["event"] == spaces.Box(0, 255, (HEIGHT, WIDTH, 5), np.uint8)  # type: ignore[index]

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -17,7 +18,7 @@ from sb3_have import HAVESAC
 from sb3_have.sensors import DepthObservation, EventObservation, RenderObservation, decode_depth
 
 Env = gym.Env[Any, Any]
-PACKAGES = "Debian and Ubuntu: apt install libegl1 libgl1-mesa-dri"
+PACKAGES = "Debian and Ubuntu: apt install libegl1 libopengl0 libgl1-mesa-dri"
 PROBE = """
 import gymnasium as gym
 env = gym.make("InvertedPendulum-v5", render_mode="rgb_array", width=8, height=8)
@@ -43,8 +44,8 @@ def missing() -> str | None:
     except subprocess.TimeoutExpired:
         return f"MuJoCo hangs when it renders with EGL ({PACKAGES})"
     if probe.returncode:
-        last = (probe.stderr.strip().splitlines() or [f"exit code {probe.returncode}"])[-1]
-        return f"MuJoCo cannot render with EGL: {last} ({PACKAGES})"
+        errors = re.findall(r"^\w+Error: .*$", probe.stderr, re.MULTILINE) or [f"exit code {probe.returncode}"]
+        return f"MuJoCo cannot render with EGL: {errors[0]} ({PACKAGES})"
     return None
 
 

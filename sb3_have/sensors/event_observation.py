@@ -135,7 +135,7 @@ class EventObservation(SensorWrapper):
 
     def sense(self, observation: Observation, start: bool) -> NDArray[np.uint8]:
         """The events since the previous step, uint8 (H, W, channels)."""
-        frames = [self._intensity(frame) for frame in self._frames(observation, start)]
+        frames = [self._intensity(frame) for frame in self._frames(observation)]
         if start:
             self.camera.reset()
             self.camera.detect(frames[-1], 0.0)
@@ -150,10 +150,10 @@ class EventObservation(SensorWrapper):
         )
         return encode_events(image, self.representation)
 
-    def _frames(self, observation: Observation, start: bool) -> Sequence[Array]:
-        """The frames since the previous step, oldest first."""
+    def _frames(self, observation: Observation) -> Sequence[Array]:
+        """The frames since the previous step, oldest first; after a reset only the last counts."""
         if self.source == "render":
-            between = [] if start or self._intermediate is None else self._intermediate.frames
+            between = [] if self._intermediate is None else self._intermediate.frames
             return [*between, *self.look().colour]
         if isinstance(self.source, str):
             return [observation[self.source]]
@@ -173,7 +173,7 @@ class EventObservation(SensorWrapper):
             )
         if frame.dtype.kind == "f":
             return resize(frame.astype(np.float64), self.image_size)
-        grey = frame.astype(np.float64)
+        grey: Array = frame.astype(np.float64)
         if frame.ndim == 3 and frame.shape[2] == 3:
             grey = cv2.transform(grey, LUMA)
         grey = resize(grey.reshape(frame.shape[:2]), self.image_size)
@@ -193,7 +193,7 @@ class EventObservation(SensorWrapper):
         if not isinstance(self.source, str):
             if size is None:
                 self.env.reset()
-                size = self._frames({}, start=True)[-1].shape[:2]
+                size = self._frames({})[-1].shape[:2]
             return size
         space = pick(self.inner_spaces, self.source, self.class_name())
         if not isinstance(space, spaces.Box) or space.dtype != np.uint8 or not _is_frame(space.shape, space.dtype):
