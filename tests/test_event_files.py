@@ -179,7 +179,7 @@ def test_an_index_into_the_middle_of_simultaneous_events(tmp_path: Path) -> None
 @pytest.mark.parametrize("convention", ["dsec", "m3ed"])
 def test_what_is_written_is_read(tmp_path: Path, convention: Convention) -> None:
     events, path = recording(), tmp_path / "events.h5"
-    offset = 12.345678 if convention == "dsec" else 0.0
+    offset = 8.2 if convention == "dsec" else 0.0
     write_events(path, events, HEIGHT, WIDTH, convention, t_offset=offset)
     with EventFile(path) as recorded:
         assert (recorded.height, recorded.width, recorded.t_offset) == (HEIGHT, WIDTH, offset)
@@ -206,6 +206,7 @@ def test_what_is_written_is_what_the_data_sets_have(tmp_path: Path) -> None:
         assert group["ms_map_idx"][:].tolist() == DSEC_INDEX
         assert [group[name].dtype.str for name in "xytp"] == ["<u2", "<u2", "<i8", "|i1"]
         assert group["calib/resolution"][:].tolist() == [WIDTH, HEIGHT]
+        np.testing.assert_array_equal(group["p"], events["p"] > 0)
         assert group["t"].compression == "lzf"
 
 
