@@ -13,6 +13,7 @@ from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack
 
+from benchmarks import failure_picture
 from sb3_have import HAVESAC
 from sb3_have.sensors import SensorFailure, failures_for
 from tests.envs import TINY, RandomSensors, image, vector
@@ -90,6 +91,21 @@ def test_sensors_of_highway_vision_fail_alone(modality: str) -> None:
             assert env.observation_space.contains(failed) and info["weather"] == "ClearNoon"
             for key in clean:
                 assert (failed[key] == clean[key]).all() == (key != modality), (kind, key)
+
+
+def test_the_contact_sheet_has_a_cell_for_every_kind_that_a_sensor_knows(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(failure_picture, "STEPS", 4)
+    monkeypatch.setattr(failure_picture, "SIZE", 36)
+    paper = failure_picture.sheet(("black", "event_storm"))
+
+    def cell(row: int, block: int, column: int) -> Any:
+        y, x = failure_picture.HEADER + row * 40, failure_picture.LABELS + block * (3 * 40 + 4) + column * 40
+        return paper[y : y + 36, x : x + 36]
+
+    assert (cell(1, 0, 2) == 0).all() and (cell(1, 2, 2) == 0).all()  # black: rgb, depth
+    assert (cell(1, 1, 2) == 255).all()  # and no event
+    assert (cell(1, 0, 0)[:, :24] == cell(0, 0, 0)[:, :24]).all()  # a third lost, the rest intact
+    assert (cell(2, 1, 2) != cell(0, 1, 0)).any() and (cell(2, 0, 2) == 255).all() and (cell(2, 2, 2) == 255).all()
 
 
 def test_havesac_learns_with_a_failing_sensor() -> None:
