@@ -173,6 +173,7 @@ def test_action_repeat_over_collected_frames() -> None:
         # Halves may be rounded either way.
         difference = np.abs(observations[i + 1]["sparks"].astype(float) - 128 - voxels)
         assert difference.max() < 0.5 + 1e-6
+    assert env.time == pytest.approx(1.2)
     with pytest.raises(ValueError, match="no frame"):
         env.sense({}, start=False)
 
@@ -192,7 +193,7 @@ def test_known_environments(env_id: str, dt: float) -> None:
     assert any((observation["event"] != 128).any() for observation in observations)
     env.reset()
     env.step(env.action_space.sample())
-    assert env._time == pytest.approx(dt)
+    assert env.time == pytest.approx(dt)
     env.close()
 
 
@@ -264,6 +265,8 @@ def test_same_seed_same_noise() -> None:
     assert (first != other).any()
     assert (noise(make(), None) != noise(make(), None)).any()
     assert (first[0] == 128).all()
+    first, again = (noise(EventObservation(MovingBar("rgb_array"), camera="noisy"), 7) for _ in range(2))
+    np.testing.assert_array_equal(first, again)  # its pixels are the same chip's too
 
 
 def test_the_sensor_leaves_the_environment_alone() -> None:
@@ -324,6 +327,7 @@ def bar(**kwargs: Any) -> Env:
         (lambda: bar(camera=EventCamera(4, 6)), ValueError, r"4 x 6 pixels, the image 36 x 40; pass image_size=\(4, 6"),
         (lambda: bar(representation="image"), ValueError, "voxel"),
         (lambda: bar(bins=0), ValueError, "bins"),
+        (lambda: bar(bins=2.5), ValueError, "bins must be a whole number, got 2.5"),
         (lambda: bar(tau=-1.0, representation="time_surface"), ValueError, "tau"),
         (lambda: bar(image_size=-3), ValueError, "image_size"),
         (lambda: bar(dt=0.0), ValueError, "dt must be.*got 0.0"),
@@ -357,4 +361,4 @@ def test_bad_frames(frame: Any, message: str) -> None:
 def test_time_that_the_environment_does_not_know_may_be_told() -> None:
     env = EventObservation(Timeless("rgb_array"), dt=0.5)
     episode(env, 2)
-    assert env._time == 1.0
+    assert env.time == 1.0

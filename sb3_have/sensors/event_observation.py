@@ -110,6 +110,8 @@ class EventObservation(SensorWrapper):
         )
         SensorWrapper.__init__(self, env, key)
         self.source, self.bins, self.representation, self.tau = source, bins, representation, tau
+        if not isinstance(bins, (int, np.integer)):
+            raise ValueError(f"bins must be a whole number, got {bins!r}")
         if dt is not None and not 0 < dt < np.inf:
             raise ValueError(f"dt must be a finite number of seconds > 0, got {dt!r}")
         if dt is None and step_duration(env) is None:
@@ -121,7 +123,8 @@ class EventObservation(SensorWrapper):
         self._intermediate = IntermediateFrames(env.unwrapped) if source == "render" and is_highway_env(env) else None
         height, width = self.image_size = self._check_source(parse_size(image_size))
         self.camera = make_camera(camera, height, width)
-        self._time = 0.0
+        #: Seconds since the reset.
+        self.time = 0.0
         # Complains about a wrong option now, not at the first step.
         represent(np.empty(0, np.int64), np.empty(0), np.empty(0), bins, 0, 1, height, width, representation, tau)
         self._announce(height, width, channels(representation, bins))
@@ -139,14 +142,14 @@ class EventObservation(SensorWrapper):
         if start:
             self.camera.reset()
             self.camera.detect(frames[-1], 0.0)
-            self._time = 0.0
+            self.time = 0.0
             return np.full((*self.image_size, channels(self.representation, self.bins)), EVENT_ZERO, np.uint8)
-        begin, self._time = self._time, self._time + self._duration(len(frames))
-        times = np.linspace(begin, self._time, len(frames) + 1)[1:]
+        begin, self.time = self.time, self.time + self._duration(len(frames))
+        times = np.linspace(begin, self.time, len(frames) + 1)[1:]
         parts = [self.camera.detect(frame, float(t), self._rng) for frame, t in zip(frames, times, strict=True)]
         pixel, time, polarity = (np.concatenate(part) for part in zip(*parts, strict=True))
         image = represent(
-            pixel, time, polarity, self.bins, begin, self._time, *self.image_size, self.representation, self.tau
+            pixel, time, polarity, self.bins, begin, self.time, *self.image_size, self.representation, self.tau
         )
         return encode_events(image, self.representation)
 

@@ -165,13 +165,13 @@ class IntermediateFrames:
         self.frames: list[Array] = []
 
     def __enter__(self) -> None:
-        self.frames = []
         self._recorder, self._env._record_video_wrapper = self._env._record_video_wrapper, self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._env._record_video_wrapper = self._recorder
+        self.frames = []
 
     def _capture_frame(self) -> None:
         self.frames.append(self._env.render())
