@@ -1,27 +1,56 @@
-"""Draws the README's picture: what the three sensors of HighwayVision-v0 see in three weathers.
+"""Draws the README's pictures: what the three sensors of HighwayVision-v0 see, in three weathers and on other roads.
 
-python -m benchmarks.sensor_picture [--out docs/sensors.png]
+    python -m benchmarks.sensor_picture                   # docs/sensors.png, docs/scenarios.png
+
+On the highway the ego keeps straight; on the other roads highway-env's IDM/MOBIL driver is at the wheel.
 """
 
 import argparse
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import cv2
-import gymnasium as gym
 import numpy as np
+from highway_env.vehicle.behavior import IDMVehicle
 
-import sb3_have  # noqa: F401 (registers the environment)
-
-SEED = 6
-STEPS = 42
-WEATHERS = ("ClearNoon", "ClearNight", "HardRainNight")
+from sb3_have.envs import HighwayVisionEnv
 
 
-def picture(weather: str) -> np.ndarray:
-    """RGB | event | depth after some seconds of keeping straight, the same traffic in every weather."""
-    env = gym.make("HighwayVision-v0", image_size=128, weather=weather, render_mode="rgb_array")
-    _, info = env.reset(seed=SEED)
-    for _ in range(STEPS):
+class Shot(NamedTuple):
+    """A row of a picture: RGB | event | depth after some seconds."""
+
+    weather: str
+    scenario: str = "highway"
+    seed: int = 6
+    steps: int = 42
+
+
+PICTURES = {
+    "sensors.png": (Shot("ClearNoon"), Shot("ClearNight"), Shot("HardRainNight")),
+    "scenarios.png": (
+        Shot("ClearNoon", "merge", 1, 40),
+        Shot("ClearNoon", "curves", 0, 36),
+        Shot("WetNight", "curves", 0, 36),
+    ),
+}
+
+
+class DrivenEnv(HighwayVisionEnv):
+    """highway-env's driver at the wheel, whatever the action."""
+
+    def _reset(self) -> None:
+        super()._reset()
+        ego = self.vehicle
+        self.vehicle = IDMVehicle(self.road, ego.position, ego.heading, ego.speed, target_speed=self.max_speed)
+        self.road.vehicles[0] = self.vehicle
+
+
+def picture(shot: Shot) -> np.ndarray:
+    """The same traffic in every weather."""
+    env_class = HighwayVisionEnv if shot.scenario == "highway" else DrivenEnv
+    env: Any = env_class(shot.weather, image_size=128, render_mode="rgb_array", scenario=shot.scenario)
+    _, info = env.reset(seed=shot.seed)
+    for _ in range(shot.steps):
         throttle = float(np.clip(25 - info["speed"], -1, 1))
         _, _, _, _, info = env.step(np.array([throttle, 0.0], dtype=np.float32))
     frame = np.asarray(env.render())
@@ -30,13 +59,15 @@ def picture(weather: str) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--out", type=Path, default=Path("docs/sensors.png"))
-    out = parser.parse_args().out
-    out.parent.mkdir(parents=True, exist_ok=True)
-    rows = np.concatenate([picture(weather) for weather in WEATHERS])
-    cv2.imwrite(str(out), rows[..., ::-1])
-    print(f"wrote {out} ({rows.shape[1]}x{rows.shape[0]})")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--pictures", nargs="+", choices=list(PICTURES), default=list(PICTURES))
+    parser.add_argument("--out", type=Path, default=Path("docs"), help="folder")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    for name in args.pictures:
+        rows = np.concatenate([picture(shot) for shot in PICTURES[name]])
+        cv2.imwrite(str(args.out / name), rows[..., ::-1])
+        print(f"wrote {args.out / name} ({rows.shape[1]}x{rows.shape[0]})")
 
 
 if __name__ == "__main__":

@@ -171,7 +171,8 @@ class Camera:
             # A road that bends or forks has its roadside before vehicles as well as behind them.
             away = np.maximum(np.hypot(*start[instant, face].T), np.hypot(*end[instant, face].T))
             vehicle = faces.vehicle[instant, face]
-            away = np.where(vehicle < 0, away, np.hypot(forward, right)[instant, vehicle])
+            middle = np.concatenate((np.hypot(forward, right), 0.0 * every), axis=1)
+            away = np.where(vehicle < 0, away, middle[instant, vehicle])
             order = np.lexsort((-away, instant))
             instant, face = instant[order], face[order]
         start, end = start[instant, face], end[instant, face]
