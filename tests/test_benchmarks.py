@@ -8,7 +8,7 @@ import pytest
 import torch as th
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples
 
-from benchmarks import replay_memory, update_speed
+from benchmarks import event_speed, replay_memory, update_speed
 from benchmarks.measure import Times, interleave, save
 from benchmarks.random_sensors import CHANNELS, make_env
 from sb3_have import HAVESAC
@@ -104,3 +104,24 @@ def test_save_replaces_only_what_was_measured_anew(tmp_path: Path) -> None:
     save([{"shape": "a", "ms": 1.0}, {"shape": "b", "ms": 2.0}], path, ["shape"])
     save([{"shape": "a", "ms": 3.0}], path, ["shape"])
     assert dict(pd.read_csv(path).to_numpy().tolist()) == {"a": 3.0, "b": 2.0}
+
+
+def test_event_speed_has_a_row_for_every_camera() -> None:
+    contenders = [
+        event_speed.Contender("setting", setting, image_size=32, output=output)
+        for setting in event_speed.SETTINGS
+        for output in ("sorted", "unsorted")
+    ]
+    rows = event_speed.measure(contenders, rounds=2, repeats=4)
+    assert [(row["setting"], row["output"]) for row in rows] == [(c.setting, c.output) for c in contenders]
+    assert all(row["median_ms"] > 0 and row["ns_per_event"] > 0 for row in rows)
+    events = {(row["setting"], row["output"]): row["events"] for row in rows}
+    assert events["ideal", "sorted"] == events["ideal", "unsorted"] > 0  # the same film, and noise of the same seed
+    assert events["noisy", "sorted"] == events["noisy", "unsorted"] > events["carla", "sorted"]
+
+
+def test_the_film_goes_round_without_a_jump() -> None:
+    film = event_speed.film(image_size=40, contrast=0.3)
+    steps = np.abs(np.log(np.roll(film, -1, axis=0)) - np.log(film)).mean(axis=(1, 2))
+    assert film.shape == (event_speed.FRAMES, 40, 40) and steps.min() > 0
+    assert steps.max() < 1.2 * steps.min()

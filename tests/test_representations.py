@@ -134,8 +134,13 @@ def test_no_events_is_zero_and_bad_windows_raise(function: Represent) -> None:
     depth = 2 * BINS if function is polarity_counts else BINS
     assert none.shape == (HEIGHT, WIDTH, depth) and not none.any() and none.dtype == np.float64
     assert not time_surface(np.empty(0, EVENT_DTYPE), T1, 0.1, HEIGHT, WIDTH).any()
-    with pytest.raises(ValueError, match="t1 > t0"):
-        function(events(), BINS, T1, T1, HEIGHT, WIDTH)
+    for t0, t1 in ((T1, T1), (-np.inf, T1), (T0, np.inf), (np.nan, T1)):
+        with pytest.raises(ValueError, match="finite times t0 < t1"):
+            function(events(), BINS, t0, t1, HEIGHT, WIDTH)
+    recorded = events()
+    recorded["p"] = recorded["p"] > 0
+    with pytest.raises(ValueError, match=r"\+1 or -1.*2 \* p - 1"):
+        function(recorded, BINS, T0, T1, HEIGHT, WIDTH)
     with pytest.raises(ValueError, match="outside an image"):
         function(events(), BINS, T0, T1, HEIGHT, WIDTH - 1)
 

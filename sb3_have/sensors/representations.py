@@ -29,7 +29,7 @@ def stack_by_time(
     :param height: Rows.
     :param width: Columns.
     :return: (height, width, bins), signed counts.
-    :raises ValueError: on an empty window, no bins, or events outside the image.
+    :raises ValueError: on an empty or endless window, no bins, events outside the image, or other polarities.
     """
     return represent(*_flatten(events, height, width), bins, t0, t1, height, width, "sbt")
 
@@ -127,7 +127,7 @@ def represent(
     :param pixel: Pixel index of every event, row * width + column.
     :param times: Time of every event in seconds.
     :param polarity: +1 or -1 of every event.
-    :param bins: Number of slices; a time surface has none and takes no notice.
+    :param bins: Number of slices, >= 1; a time surface has none and takes no notice.
     :param t0: Start of the window in seconds.
     :param t1: End of the window; events outside [t0, t1] are left out.
     :param height: Rows.
@@ -139,8 +139,9 @@ def represent(
     :return: (height, width, C) with C as :func:`channels` has it.
     """
     depth = channels(representation, bins)
-    if not t1 > t0:
-        raise ValueError(f"need t1 > t0, got t0={t0}, t1={t1}")
+    # A time surface looks back as far as it likes; slices need two ends.
+    if not t0 < t1 < np.inf or (t0 == -np.inf and representation != "time_surface"):
+        raise ValueError(f"need finite times t0 < t1, got t0={t0}, t1={t1}")
     if tau is not None and representation != "time_surface":
         raise ValueError(f"tau is the time constant of 'time_surface'; leave it out for {representation!r}")
     inside = (times >= t0) & (times <= t1)
@@ -177,7 +178,8 @@ def _time_surface(
 def encode_events(values: ArrayLike, representation: Representation = "sbt") -> NDArray[np.uint8]:
     """
     8-bit form of an event image: 128 + count, the count rounded and clipped to -127..127. A time surface, between 0
-    and 1, is 128 + 127 * value. In either form 128 is "no event" and the code grows with what there was.
+    and 1, is 128 + 127 * value. In either form 128 is "no event" and the code grows with what there was; events older
+    than 5.5 time constants are rounded to it.
 
     :param values: Array of any shape.
     :param representation: What the values are; all but ``"time_surface"`` are counts.
@@ -213,4 +215,7 @@ def _flatten(
     x, y = events["x"].astype(np.int64), events["y"].astype(np.int64)
     if len(events) and (x.min() < 0 or y.min() < 0 or x.max() >= width or y.max() >= height):
         raise ValueError(f"events lie outside an image of {height} rows and {width} columns")
-    return y * width + x, events["t"].astype(np.float64), events["p"].astype(np.float64)
+    polarity = events["p"].astype(np.float64)
+    if (np.abs(polarity) != 1).any():
+        raise ValueError("polarities p must be +1 or -1; turn 0 and 1, as most files have them, into 2 * p - 1")
+    return y * width + x, events["t"].astype(np.float64), polarity
