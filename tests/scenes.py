@@ -5,10 +5,9 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from envs import image, vector
 from gymnasium import spaces
 from numpy.typing import NDArray
-
-from tests.envs import image, vector
 
 Array = NDArray[Any]
 Env = gym.Env[Any, Any]

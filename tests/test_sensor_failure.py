@@ -6,11 +6,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from envs import image, vector
 from gymnasium import spaces
+from scenes import SPACE, Array, Env, Remembers, Scenes, active, rollout, same
 
 from sb3_have.sensors import FAILURES, SensorFailure, failures_for
-from tests.envs import image, vector
-from tests.scenes import SPACE, Array, Env, Remembers, Scenes, active, rollout, same
 
 SENSOR_OF = {"rgb": "rgb", "event": "event", "depth": "depth", "state": "vector"}
 PAIRS = [(kind, key) for key, sensor in SENSOR_OF.items() for kind in failures_for(sensor)]

@@ -7,17 +7,17 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from envs import TINY, RandomSensors, image, vector
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
+from scenes import SPACE, Env, Scenes, rollout, same
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecFrameStack
 
 from benchmarks import failure_picture
 from sb3_have import HAVESAC
 from sb3_have.sensors import SensorFailure, failures_for
-from tests.envs import TINY, RandomSensors, image, vector
-from tests.scenes import SPACE, Env, Scenes, rollout, same
 
 
 def make_failing() -> Env:
