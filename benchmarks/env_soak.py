@@ -1,6 +1,7 @@
-"""Drive HighwayVision-v0 at random for many episodes in every weather and check every step.
+"""Drive HighwayVision-v0 for many episodes in every weather and check every step.
 
     python -W error -m benchmarks.env_soak --episodes 100
+    python -W error -m benchmarks.env_soak --episodes 10 --scenarios merge curves --driver idm
 
 Fails on an exception, a warning (-W error), a number that is not finite or an observation outside of its space.
 """
@@ -13,13 +14,15 @@ from collections import Counter
 
 import numpy as np
 
+from benchmarks.sensor_picture import DrivenEnv
 from sb3_have.envs import HighwayVisionEnv
+from sb3_have.envs.road_shape import SCENARIOS
 from sb3_have.envs.weather import WEATHERS
 
 
-def soak(weather: str, episodes: int, image_size: int, seed: int) -> str:
-    """Drive; returns what was seen in one line."""
-    env = HighwayVisionEnv(weather=weather, image_size=image_size)
+def soak(weather: str, episodes: int, image_size: int, seed: int, scenario: str = "highway", idm: bool = False) -> str:
+    """Drive at random, or with highway-env's driver; returns what was seen in one line."""
+    env = (DrivenEnv if idm else HighwayVisionEnv)(weather=weather, image_size=image_size, scenario=scenario)
     env.action_space.seed(seed)
     distances, ends, steps = [], Counter[str](), 0
     start = time.perf_counter()
@@ -37,7 +40,7 @@ def soak(weather: str, episodes: int, image_size: int, seed: int) -> str:
         distances.append(info["distance"])
         ends[info["end_reason"]] += 1
     return (
-        f"{weather:13} {episodes} episodes, {steps} steps, "
+        f"{scenario} {weather:13} {episodes} episodes, {steps} steps, "
         f"distance {np.mean(distances):.0f} +- {np.std(distances):.0f} m, "
         f"{dict(ends)}, {steps / (time.perf_counter() - start):.0f} steps/s"
     )
@@ -48,10 +51,14 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--image-size", type=int, default=64)
     parser.add_argument("--weathers", nargs="+", choices=WEATHERS, default=list(WEATHERS))
+    parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=["highway"])
+    parser.add_argument("--driver", choices=["random", "idm"], default="random")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    for weather in args.weathers:
-        print(soak(weather, args.episodes, args.image_size, args.seed), flush=True)
+    for scenario in args.scenarios:
+        for weather in args.weathers:
+            line = soak(weather, args.episodes, args.image_size, args.seed, scenario, args.driver == "idm")
+            print(line, flush=True)
 
 
 if __name__ == "__main__":

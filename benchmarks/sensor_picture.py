@@ -28,9 +28,9 @@ class Shot(NamedTuple):
 PICTURES = {
     "sensors.png": (Shot("ClearNoon"), Shot("ClearNight"), Shot("HardRainNight")),
     "scenarios.png": (
-        Shot("ClearNoon", "merge", 1, 40),
-        Shot("ClearNoon", "curves", 0, 36),
-        Shot("WetNight", "curves", 0, 36),
+        Shot("ClearNoon", "merge", 1, 36),
+        Shot("ClearNoon", "curves", 2, 43),
+        Shot("ClearNight", "curves", 2, 43),
     ),
 }
 

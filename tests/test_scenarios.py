@@ -87,7 +87,7 @@ def test_oncoming_traffic_is_met_head_on_and_brakes_but_does_not_reverse() -> No
     ego.position = lane.position(lane.local_coordinates(ego.position)[0], 0.0)
     ego.on_state_update()
     along = lane.local_coordinates(ego.position)[0]
-    car = ScenarioDriver.make_on_lane(env.road, (*ONCOMING, 0), along - 150.0, 20.0)
+    car: Any = ScenarioDriver.make_on_lane(env.road, (*ONCOMING, 0), along - 150.0, 20.0)
     assert car.position[0] == pytest.approx(ego.position[0] + 150) and math.cos(car.heading) < -0.98
     assert env.road.neighbour_vehicles(car)[0] is ego
     car.enable_lane_change = False

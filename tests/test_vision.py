@@ -4,7 +4,7 @@ import importlib.util
 import pickle
 from itertools import chain, combinations
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from sb3_have.envs.vision import MODALITIES, VisionSensors, compose
 from sb3_have.envs.weather import WEATHERS, rain_events, weather_by_name
-from sb3_have.sensors import decode_depth, decode_events
+from sb3_have.sensors import Representation, decode_depth, decode_events
 
 Array = NDArray[Any]
 SUBSETS = list(chain.from_iterable(combinations(MODALITIES, n) for n in (1, 2, 3)))
@@ -153,6 +153,44 @@ def test_event_options_reach_the_camera() -> None:
     assert VisionSensors(48, event={"bins": 3, "subframes": 4}).spaces["event"].shape == (48, 48, 3)
 
 
+@pytest.mark.parametrize("representation", get_args(Representation))
+def test_every_representation_in_its_space(representation: Representation) -> None:
+    sensors = VisionSensors(32, ("event",), event={"representation": representation, "bins": 3})
+    images = [observation["event"] for observation in episode(sensors, "ClearNoon")]
+    shape = (32, 32, {"polarity": 6, "time_surface": 2}.get(representation, 3))
+    assert sensors.spaces["event"].shape == shape and all(sensors.spaces["event"].contains(image) for image in images)
+    assert (images[0] == 128).all() and (images[-1] != 128).any()
+    assert (images[-1].min() < 128) == (representation in ("sbt", "voxel"))
+
+
+def test_representations_agree() -> None:
+    """The same events in different forms: polarities apart and together, and how recent the last one is."""
+    image = {}
+    for kind in get_args(Representation):
+        sensors = VisionSensors(48, ("event",), event={"representation": kind, "bins": 2})
+        image[kind] = episode(sensors, "ClearNoon")[-1]["event"]
+    apart = decode_events(image["polarity"])
+    np.testing.assert_array_equal(apart[..., :2] - apart[..., 2:], decode_events(image["sbt"]))
+    np.testing.assert_array_equal(apart[..., :2] + apart[..., 2:], decode_events(image["count"]))
+    surface = decode_events(image["time_surface"], "time_surface")
+    some = np.stack((apart[..., :2].sum(axis=-1), apart[..., 2:].sum(axis=-1)), axis=-1) > 0
+    np.testing.assert_array_equal(surface > 0, some)
+    assert some.any() and surface[some].min() >= np.exp(-1) - 0.005  # tau is one control step
+    late = np.stack((apart[..., 1], apart[..., 3]), axis=-1) > 0
+    assert surface[late].min() >= np.exp(-0.5) - 0.005 >= surface[some & ~late].max() - 0.01
+    short = VisionSensors(48, ("event",), event={"representation": "time_surface", "tau": 0.05})
+    assert decode_events(episode(short, "ClearNoon")[-1]["event"], "time_surface")[some].min() < 0.2
+
+
+def test_bandwidth_reaches_the_camera() -> None:
+    def activity(**event: Any) -> float:
+        images = [o["event"] for o in episode(VisionSensors(48, ("event",), event=event), "ClearNoon")]
+        return float(np.mean([np.abs(decode_events(image)).mean() for image in images]))
+
+    assert activity(cutoff_hz=1e6) == pytest.approx(activity(), rel=1e-3)
+    assert activity(cutoff_hz=0.5) < 0.7 * activity()
+
+
 def test_night_leaves_events_and_takes_contrast() -> None:
     path = Path(__file__).parent.parent / "benchmarks" / "weather_contrast.py"
     spec = importlib.util.spec_from_file_location("weather_contrast", path)
@@ -177,6 +215,13 @@ def test_compose_shows_the_modalities_side_by_side() -> None:
     quiet = (observation["event"] == 128).all(axis=-1)
     assert (picture[::3, 96:192:3][quiet] == 255).all()
     assert (picture[::3, 192::3][observation["depth"][..., 0] == 0] == 0).all()
+    for kind in ("polarity", "time_surface"):
+        # A positive event now and an older negative one.
+        events = np.full((32, 32, 2), 128, dtype=np.uint8)
+        events[0, 0, 0], events[0, 1, 1] = 255, 255
+        colours = compose({"event": events}, scale=1, representation=kind)
+        assert colours[0, 0, 0] > colours[0, 0, 2] and colours[0, 1, 0] < colours[0, 1, 2]
+        assert (colours[1:] == 255).all()
     assert compose({"depth": observation["depth"]}, scale=1).shape == (32, 32, 3)
     with pytest.raises(ValueError, match="lidar"):
         compose({"lidar": observation["depth"]})
@@ -195,6 +240,11 @@ def test_compose_shows_the_modalities_side_by_side() -> None:
         ({"event": {"treshold": 0.1}}, r"\['treshold'\].*threshold"),
         ({"event": {"representation": "image"}}, "voxel"),
         ({"event": {"subframes": 0}}, "subframes"),
+        ({"event": {"tau": 0.1}}, "tau.*time_surface.*'sbt'"),
+        ({"event": {"representation": "time_surface", "tau": -1.0}}, "tau.*-1"),
+        ({"event": {"cutoff_hz": 0.0}}, "cutoff_hz"),
+        ({"scenario": "city"}, "highway, merge, curves"),
+        ({"scenario": "curves", "lanes_count": 3}, "even"),
         ({"event": {"subframes": 4.5}}, "subframes.*whole number.*4.5"),
         ({"event": {"bins": 2.7}}, "bins.*whole number.*2.7"),
         ({"depth": {"maximum": 10}}, r"\['maximum'\].*max"),
