@@ -164,6 +164,16 @@ def test_ctrl_c_while_closing_does_not_stop_the_rest(
     assert server.left_behind() == []
 
 
+@pytest.mark.parametrize("call", ["Sensor.stop", "Client.apply_batch_sync", "World.apply_settings"])
+def test_an_impatient_ctrl_c_is_made_good_by_the_next_reset(server: Server, env: CarlaVisionEnv, call: str) -> None:
+    env.reset()
+    server.fail("World.tick", KeyboardInterrupt(), after=1)
+    server.fail(call, KeyboardInterrupt())  # while the first is being cleaned up
+    with pytest.raises(KeyboardInterrupt):
+        env.step(FULL)
+    works(server, env)
+
+
 # ---- the server ----
 
 
