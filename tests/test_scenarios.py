@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from typing import Any
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
@@ -82,7 +82,7 @@ def test_traffic_keeps_its_side_and_its_number_and_appears_out_of_sight(scenario
 def test_oncoming_traffic_is_met_head_on_and_brakes_but_does_not_reverse() -> None:
     env = BlindEnv(scenario="curves", vehicles_count=0)
     env.reset(seed=0)
-    ego: Any = env.vehicle
+    ego = cast(Any, env.vehicle)
     lane = env.road.network.get_lane((*ONCOMING, 0))
     ego.position = lane.position(lane.local_coordinates(ego.position)[0], 0.0)
     ego.on_state_update()

@@ -157,7 +157,7 @@ class Camera:
         in_view = (forward > -5) & (forward < FAR + 5) & (np.abs(right) < 0.6 * forward + 12)
         shown = np.flatnonzero(in_view.any(axis=0))
         order = shown[np.argsort(-np.hypot(forward[:, shown], right[:, shown]), axis=1, kind="stable")]
-        faces = Faces.concatenate(self.roadside.faces(x, FAR), vehicle_faces(traffic, sizes[1:], order, self._front))
+        faces = Faces.concatenate(*self.roadside.faces(x, FAR), vehicle_faces(traffic, sizes[1:], order, self._front))
 
         start, end = _to_camera(faces.start, x, y, heading), _to_camera(faces.end, x, y, heading)
         # Turned towards the camera: the start lies to the left of the end.

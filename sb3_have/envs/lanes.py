@@ -31,7 +31,7 @@ class BentLane(AxisLane):
     def __init__(self, shape: RoadShape, number: int) -> None:
         y = number * shape.lane_width
         super().__init__([0.0, y], [ROAD_LENGTH, y], line_types=_line_types(shape, number), speed_limit=SPEED_LIMIT)
-        self.shape, self.centre = shape, y
+        self.shape = shape
         self.sign = -1.0 if number < shape.oncoming else 1.0
 
     def position(self, longitudinal: float, lateral: float) -> np.ndarray:

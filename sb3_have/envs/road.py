@@ -10,6 +10,8 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from highway_env.road.lane import LineType, StraightLane
@@ -32,8 +34,12 @@ class AxisLane(StraightLane):
     sign = 1.0
     """+1 where it is driven towards +x, -1 where towards -x."""
 
+    def __init__(self, start: Sequence[float], end: Sequence[float], **kwargs: Any) -> None:
+        super().__init__(start, end, **kwargs)
+        self.beginning, self.centre = float(start[0]), float(start[1])
+
     def local_coordinates(self, position: np.ndarray) -> tuple[float, float]:
-        return float(position[0] - self.start[0]), float(position[1] - self.start[1])
+        return float(position[0]) - self.beginning, float(position[1]) - self.centre
 
     def heading_at(self, longitudinal: float) -> float:
         return 0.0
@@ -44,7 +50,7 @@ class AxisLane(StraightLane):
 
         :param placed: x [m], y [m] and vehicle
         """
-        centre = float(self.start[1])
+        centre = self.centre
         return [(x, vehicle) for x, y, vehicle in placed if abs(y - centre) <= LANE_WIDTH / 2 + 1]
 
 

@@ -156,14 +156,14 @@ class Roadside:
         jitter = (int(WORLD_PERIOD / TREE_SPACING), 2, 2)
         self._jitter = np.random.default_rng(0).uniform(-1, 1, jitter) * (4.0, 2.5)
 
-    def faces(self, x: Array, sight: float) -> Faces:
+    def faces(self, x: Array, sight: float) -> tuple[Faces, Faces]:
         """
-        What can be seen from each x; far to near on a plain road.
+        Trees and rails that can be seen from each x; far to near on a plain road.
 
         :param x: Positions along the road, (instants,).
         :param sight: Distance at which the guard-rails end.
         """
-        return Faces.concatenate(self._trees(x), self._rail(x, sight) if self.shape.plain else self._pieces(x, sight))
+        return self._trees(x), self._rail(x, sight) if self.shape.plain else self._pieces(x, sight)
 
     def _trees(self, x: Array) -> Faces:
         # Every instant has the faces around its own x, so that it looks the same whichever others are rendered with it.
