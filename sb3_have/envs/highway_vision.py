@@ -18,7 +18,7 @@ from sb3_have.envs.lanes import FORWARD, ShapedNetwork
 from sb3_have.envs.road import LANE_WIDTH, SPEED_LIMIT, HighwayNetwork, HighwayRoad
 from sb3_have.envs.road_shape import PERIOD, road_shape
 from sb3_have.envs.vision import VisionSensors, compose
-from sb3_have.envs.weather import WEATHERS
+from sb3_have.envs.weather import weather_choices
 
 START_X = 1000.0
 """Where the ego vehicle starts along the road [m]: far from the road's own ends."""
@@ -148,7 +148,7 @@ class HighwayVisionEnv(AbstractEnv):
 
         self.shape = road_shape(scenario, int(lanes_count), LANE_WIDTH)
         self.scenario = scenario
-        self.weathers = _weather_choices(weather)
+        self.weathers = weather_choices(weather)
         self.vehicles_count, self.lanes_count = int(vehicles_count), int(lanes_count)
         self.traffic_speed = (float(traffic_speed[0]), float(traffic_speed[1]))
         self.max_episode_steps, self.initial_speed = max_episode_steps, float(initial_speed)
@@ -220,7 +220,7 @@ class HighwayVisionEnv(AbstractEnv):
         unknown = set(options or {}) - {"weather"}
         if unknown:
             raise ValueError(f"unknown reset options {sorted(unknown)}; the only one is 'weather'")
-        self._choices = _weather_choices(options["weather"]) if options else self.weathers
+        self._choices = weather_choices(options["weather"]) if options else self.weathers
         draws = self.action_space.np_random.bit_generator
         before = draws.state
         observation, info = super().reset(seed=seed)
@@ -315,14 +315,3 @@ class ReportTimeout(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         if truncated and info["end_reason"] is None:
             info["end_reason"] = "timeout"
         return observation, reward, terminated, truncated, info
-
-
-def _weather_choices(weather: str | Sequence[str]) -> tuple[str, ...]:
-    """The weathers an option stands for."""
-    if isinstance(weather, str) and weather == "random":
-        return WEATHERS
-    choices = (weather,) if isinstance(weather, str) or weather is None else tuple(weather)
-    unknown = [name for name in choices if name not in WEATHERS]
-    if unknown or not choices:
-        raise ValueError(f"weather must be 'random' or among {', '.join(WEATHERS)}; got {weather!r}")
-    return choices

@@ -7,6 +7,7 @@ camera works on the logarithm and hardly notices.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -140,6 +141,22 @@ def weather_by_name(name: str) -> Weather:
     if name not in _WEATHERS:
         raise ValueError(f"unknown weather {name!r}; the weathers are {', '.join(WEATHERS)}")
     return _WEATHERS[name]
+
+
+def weather_choices(weather: str | Sequence[str]) -> tuple[str, ...]:
+    """
+    The weathers that the option ``weather`` of an environment stands for.
+
+    :param weather: One of :data:`WEATHERS`, a list of such, or "random" for all of them.
+    :raises ValueError: on any other name, and on none.
+    """
+    if isinstance(weather, str) and weather == "random":
+        return WEATHERS
+    choices = (weather,) if isinstance(weather, str) or weather is None else tuple(weather)
+    unknown = [name for name in choices if name not in WEATHERS]
+    if unknown or not choices:
+        raise ValueError(f"weather must be 'random' or among {', '.join(WEATHERS)}; got {weather!r}")
+    return choices
 
 
 #: Unit vector towards the sun (forward, right, up): high, behind the ego and to its left, so rear faces are lit.

@@ -14,8 +14,8 @@ from gymnasium import spaces
 
 from sb3_have.envs.carla_vision.rules import Reward, RewardForm, Trip
 from sb3_have.envs.carla_vision.sensors import dvs_attributes, event_options
-from sb3_have.envs.highway_vision import _weather_choices
 from sb3_have.envs.vision import DEPTH_DEFAULTS, MODALITIES, Observation, compose
+from sb3_have.envs.weather import weather_choices
 from sb3_have.sensors.depth import encode_depth
 from sb3_have.sensors.representations import channels
 
@@ -175,7 +175,7 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
         self._reward = Reward(reward, steer_cost, brake_cost, collision_cost, crash_penalty, max_speed)
         if not 0 <= initial_speed <= max_speed:
             raise ValueError(f"initial_speed must lie in 0..max_speed ({max_speed} m/s), got {initial_speed!r}")
-        self.weathers = _weather_choices(weather)
+        self.weathers = weather_choices(weather)
         self.modalities = tuple(name for name in MODALITIES if name in modalities)
         self.max_episode_steps = max_episode_steps
         self.collision_ticks, self.standstill_time = int(collision_ticks), standstill_time
@@ -285,7 +285,7 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
         unknown = set(options or {}) - {"weather"}
         if unknown:
             raise ValueError(f"unknown reset options {sorted(unknown)}; the only one is 'weather'")
-        choices = _weather_choices(options["weather"]) if options else self.weathers
+        choices = weather_choices(options["weather"]) if options else self.weathers
         super().reset(seed=seed)
         # A generator each: the traffic does not depend on the choice of weathers.
         weather_rng, rng = (np.random.default_rng(draw) for draw in self.np_random.integers(2**63, size=2))
