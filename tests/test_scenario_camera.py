@@ -79,7 +79,7 @@ def test_lines_of_the_curves_lie_on_the_borders_of_the_lanes(x: float) -> None:
                 next_column = column_of_line(ego, lane, lateral, distance * 1.05)
                 slant = ((next_column - SIZE / 2) * 1.05 - (column - SIZE / 2)) / 0.05 / FOCAL
                 expected = lines * LINE_WIDTH * np.hypot(1, slant) * FOCAL / distance
-                assert total == pytest.approx(expected, rel=0.08)
+                assert total == pytest.approx(expected, rel=0.05)
             checked += 1
     assert checked > 22
 
@@ -200,17 +200,50 @@ def test_cars_stand_between_the_lines_of_their_lane(index: Any, distance: float)
 
 def test_a_rail_hides_the_ramp_behind_it_and_is_hidden_by_a_car_before_it() -> None:
     camera, network = road("merge")
-    ego = on_lane(network.get_lane((*FORWARD, 3)), RAMP_START + 30.0)
-    on_ramp = on_lane(network.get_lane((*FORWARD, 4)), RAMP_START + 90.0)
-    beside = on_lane(network.get_lane((*FORWARD, 3)), RAMP_START + 50.0, 2.0)
+    ego = on_lane(network.get_lane((*FORWARD, 0)), RAMP_START + 75.0)
+    on_ramp = on_lane(network.get_lane((*FORWARD, 4)), RAMP_START + 125.0)
+    beside = on_lane(network.get_lane((*FORWARD, 3)), RAMP_START + 105.0, 3.0)
     for car, hidden in [(on_ramp, True), (beside, False)]:
         objects = camera.objects(np.array([[ego, car]]), np.tile((5.0, 2.0), (2, 1)))
-        vehicle = objects.vehicle[objects.face] == 0
-        columns = np.unique((objects.pixel % SIZE)[vehicle])
-        middle = np.isin(objects.pixel % SIZE, columns[len(columns) // 4 : -len(columns) // 4])
-        rail = middle & (objects.material == STEEL)
-        depth = np.median(objects.depth[vehicle])
-        assert (rail & (objects.depth < depth - 5)).any() == hidden
+        row, column = np.divmod(objects.pixel, SIZE)
+        seen = objects.vehicle[objects.face] == 0
+        left, right = np.quantile(column[seen], (0.2, 0.8))
+        bottom = SIZE / 2 + FOCAL * 1.5 / (car[0] - ego[0] - 1 + 2.5)
+        inside = (left < column) & (column < right) & (row > row[seen].min()) & (row + 1 < bottom)
+        assert seen.sum() > 100 and (objects.material[inside] == STEEL).any() == hidden
+
+
+@pytest.mark.parametrize("scenario", NEW)
+def test_trees_and_rails_stand_beside_the_road_all_along(scenario: str) -> None:
+    camera, network = road(scenario)
+    lanes = [lane for ends in network.graph.values() for part in ends.values() for lane in part]
+
+    def on_road(point: Array, margin: float) -> bool:
+        return any(lane.on_lane(point, margin=margin) for lane in lanes)
+
+    for x in np.arange(4 * PERIOD + 3, 5 * PERIOD + 3, 60.0):
+        trees, rails = camera.roadside.faces(np.array([x]), 200.0)
+        for point in np.concatenate((trees.start[0], trees.end[0])):
+            assert not on_road(point, SHOULDER_WIDTH + 0.4)
+        for start, end in zip(rails.start[0], rails.end[0], strict=True):
+            if (start == end).all():
+                continue
+            for point in (start, 0.5 * (start + end), end):
+                # In a piece the rail is straight, and a little nearer to the road or farther from it.
+                assert not on_road(point, SHOULDER_WIDTH + 0.2)
+        # Both sides have their rail everywhere: the outer one lies just behind the shoulder.
+        near = [point for point in rails.start[0] if on_road(point, SHOULDER_WIDTH + 1.0)]
+        assert len(near) >= 20
+
+
+def test_far_lines_that_run_across_the_view_are_blurred_by_the_length_of_a_pixel() -> None:
+    camera, network = road("curves")
+    row = 2  # 120 m ahead, where the road has turned by 9 degrees and a pixel is 43 m long
+    assert 100 < camera.ground_forward[row, 0] < 140
+    bent = camera.ground(np.array([[on_lane(network.get_lane((*FORWARD, 0)), 3 * PERIOD)]])).marking[0, row]
+    straight = Camera(SIZE, road_shape("highway", 4)).ground(np.array([[(0.0, 8.0, 0.0)]])).marking[0, row]
+    assert straight.max() > 0.3 and 0 < bent.max() < 0.08
+    assert bent.sum() > 0.5
 
 
 @pytest.mark.parametrize("scenario", NEW)

@@ -2,7 +2,7 @@
 
 import hashlib
 import math
-from typing import Any, cast
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -17,6 +17,7 @@ from sb3_have.envs import HighwayVisionEnv, traffic
 from sb3_have.envs.driver import ScenarioDriver
 from sb3_have.envs.lanes import FORWARD, ONCOMING
 from sb3_have.envs.merging import MergingDriver
+from sb3_have.envs.road import ROAD_LENGTH
 from sb3_have.envs.road_shape import (
     PERIOD,
     RAMP_JOINS,
@@ -79,23 +80,36 @@ def test_traffic_keeps_its_side_and_its_number_and_appears_out_of_sight(scenario
     assert (oncoming > 2000) == (scenario == "curves") and (merged > 3) == (scenario == "merge")
 
 
+def test_oncoming_traffic_comes_from_the_front() -> None:
+    env = BlindEnv(scenario="curves", vehicles_count=0)
+    for ahead in (traffic.AHEAD + 30.0, -traffic.BEHIND - 10.0):
+        env.reset(seed=0)
+        x = float(env.vehicle.position[0])
+        car = ScenarioDriver.make_on_lane(env.road, (*ONCOMING, 0), ROAD_LENGTH - x - ahead, 20.0)
+        env.road.vehicles.append(car)
+        assert traffic.recycle(env.road, env.vehicle, (21.0, 24.0), env.np_random) == [1]
+        newcomer = env.road.vehicles[1]
+        assert newcomer.lane_index[:2] == ONCOMING and traffic.SIGHT <= newcomer.position[0] - x <= traffic.AHEAD
+
+
 def test_oncoming_traffic_is_met_head_on_and_brakes_but_does_not_reverse() -> None:
     env = BlindEnv(scenario="curves", vehicles_count=0)
     env.reset(seed=0)
-    ego = cast(Any, env.vehicle)
+    ego: Any = env.vehicle
     lane = env.road.network.get_lane((*ONCOMING, 0))
     ego.position = lane.position(lane.local_coordinates(ego.position)[0], 0.0)
     ego.on_state_update()
     along = lane.local_coordinates(ego.position)[0]
     car: Any = ScenarioDriver.make_on_lane(env.road, (*ONCOMING, 0), along - 150.0, 20.0)
     assert car.position[0] == pytest.approx(ego.position[0] + 150) and math.cos(car.heading) < -0.98
-    assert env.road.neighbour_vehicles(car)[0] is ego
+    assert env.road.neighbour_vehicles(car)[0] == ego
     car.enable_lane_change = False
     env.road.vehicles.append(car)
     for _ in range(100):
         info = env.step(STRAIGHT)[4]
         assert info["end_reason"] is None and car.speed >= 0
-    assert car.speed < 0.1 and 5 < car.position[0] - ego.position[0] < 20  # it waits for who blocks its lane
+    # It waits for who blocks its lane.
+    assert car.speed < 0.1 and 5 < car.position[0] - ego.position[0] < 20
     ego.speed = 10.0
     for _ in range(15):
         *_, terminated, _, info = env.step(STRAIGHT)

@@ -173,7 +173,7 @@ class Camera:
             vehicle = faces.vehicle[instant, face]
             middle = np.concatenate((np.hypot(forward, right), 0.0 * every), axis=1)
             away = np.where(vehicle < 0, away, middle[instant, vehicle])
-            order = np.lexsort((-away, instant))
+            order = np.argsort(-away, kind="stable")
             instant, face = instant[order], face[order]
         start, end = start[instant, face], end[instant, face]
         faces = Faces(*(getattr(faces, field.name)[instant, face] for field in fields(Faces)))

@@ -57,7 +57,7 @@ class Driver(IDMVehicle):
         speed_ratio = max(ego_vehicle.speed, 0) / abs(not_zero(target_speed))
         acceleration = self.COMFORT_ACC_MAX * (1 - float(np.power(speed_ratio, self.DELTA)))
         if front_vehicle is not None:
-            distance = ego_vehicle.lane.sign * float(front_vehicle.position[0] - ego_vehicle.position[0])
+            distance = float(front_vehicle.position[0] - ego_vehicle.position[0])  # squared: no matter whither
             gap_ratio = self.desired_gap(ego_vehicle, front_vehicle) / not_zero(distance)
             acceleration -= self.COMFORT_ACC_MAX * float(np.power(gap_ratio, 2))
         return float(acceleration)
