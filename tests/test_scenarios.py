@@ -182,6 +182,27 @@ def test_gaps_that_it_takes(offset: float, speed: float, early: bool, late: bool
         assert (car.target_lane_index == (*FORWARD, 3)) == expected
 
 
+def test_past_the_end_of_the_ramp_it_is_on_the_road() -> None:
+    env = BlindEnv(scenario="merge", vehicles_count=0)
+    car = merging(env, 450.0, 15.0)
+    car.target_speed = 11.0
+    car.position[0] = RAMP_START + 461.0
+    car.on_state_update()
+    assert car.target_lane_index == (*FORWARD, 4)
+    car.act()
+    assert car.lane_index == car.target_lane_index == (*FORWARD, 3) and car.target_speed == 22.0
+
+
+@pytest.mark.parametrize("u, called", [(20.0, True), (95.0, True), (150.0, False), (470.0, False)])
+def test_a_ramp_that_begins_ahead_calls_for_cars_from_behind(u: float, called: bool) -> None:
+    env = BlindEnv(scenario="merge", vehicles_count=0)
+    env.reset(seed=0)
+    place(env, RAMP_START + u - traffic.SIGHT, 0.0)
+    car = MergingDriver.make_on_lane(env.road, (*FORWARD, 3), env.vehicle.position[0] - 60.0, 20.0)
+    env.road.vehicles.append(car)
+    assert traffic.recycle(env.road, env.vehicle, (21.0, 24.0), env.np_random) == [1] * called
+
+
 # ---- reward, ends ----
 
 
