@@ -14,7 +14,7 @@ from collections import Counter
 
 import numpy as np
 
-from benchmarks.sensor_picture import DrivenEnv
+from benchmarks.rule_driven import RuleDrivenEnv
 from sb3_have.envs import HighwayVisionEnv
 from sb3_have.envs.road_shape import SCENARIOS
 from sb3_have.envs.weather import WEATHERS
@@ -22,7 +22,7 @@ from sb3_have.envs.weather import WEATHERS
 
 def soak(weather: str, episodes: int, image_size: int, seed: int, scenario: str = "highway", idm: bool = False) -> str:
     """Drive at random, or with highway-env's driver; returns what was seen in one line."""
-    env = (DrivenEnv if idm else HighwayVisionEnv)(weather=weather, image_size=image_size, scenario=scenario)
+    env = (RuleDrivenEnv if idm else HighwayVisionEnv)(weather=weather, image_size=image_size, scenario=scenario)
     env.action_space.seed(seed)
     distances, ends, steps = [], Counter[str](), 0
     start = time.perf_counter()

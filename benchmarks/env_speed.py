@@ -8,6 +8,7 @@ The contenders take turns in one process; those with the same traffic drive thro
 to benchmarks/results/env_speed.csv:
 
 - ``HighwayVision-v0``: for image sizes, weathers and modalities;
+- ``HighwayVision-v0, driven``: its scenarios, with an IDM/MOBIL driver at the wheel, who follows the bends;
 - ``no sensors``: its dynamics alone; ``stock road, no sensors``: the same on highway-env's own road, with its drivers;
 - ``highway-v0``: highway-env's environment with continuous actions and its default observation, 5 vehicles in numbers.
 
@@ -32,27 +33,31 @@ import torch as th
 
 from benchmarks.measure import RESULTS, Row, interleave, machine, median_ratio, quartiles, save, show
 from benchmarks.road_identity import BlindEnv, StockEnv
+from benchmarks.rule_driven import RuleDrivenEnv
 from sb3_have.envs import HighwayVisionEnv
+from sb3_have.envs.road_shape import SCENARIOS
 from sb3_have.envs.weather import WEATHERS
 
 SPEED = 15.0
 ALL = ("rgb", "event", "depth")
 COLUMNS = (
-    *("contender", "image_size", "weather", "modalities", "median_ms", "q25_ms", "q75_ms", "cpu_ms"),
+    *("contender", "scenario", "image_size", "weather", "modalities", "median_ms", "q25_ms", "q75_ms", "cpu_ms"),
     *("steps_per_s", "cpu_steps_per_s", "vs_stock"),
 )
 
 
 class Contender(NamedTuple):
-    """What is timed; the last three only where there are sensors."""
+    """What is timed; all but the name only where there are sensors."""
 
     contender: str
     image_size: int | None = None
     weather: str = ""
     modalities: tuple[str, ...] = ()
+    scenario: str = ""
 
 
 STOCK = Contender("stock road, no sensors")
+DRIVEN = "HighwayVision-v0, driven"
 
 
 def make_env(contender: Contender, control_frequency: int, vehicles: int) -> gym.Env[Any, Any]:
@@ -66,7 +71,9 @@ def make_env(contender: Contender, control_frequency: int, vehicles: int) -> gym
         return StockEnv(**kwargs)
     if contender.image_size is None:
         return BlindEnv(**kwargs)
-    return HighwayVisionEnv(contender.weather, contender.modalities, contender.image_size, **kwargs)
+    env_class = RuleDrivenEnv if contender.contender == DRIVEN else HighwayVisionEnv
+    kwargs["scenario"] = contender.scenario
+    return env_class(contender.weather, contender.modalities, contender.image_size, **kwargs)
 
 
 class Driver:
@@ -117,9 +124,10 @@ def main() -> None:
     th.set_num_threads(1)
     contenders = [STOCK, Contender("no sensors"), Contender("highway-v0")]
     contenders += [
-        Contender("HighwayVision-v0", size, weather, ALL) for size in args.sizes for weather in args.weathers
+        Contender("HighwayVision-v0", size, weather, ALL, "highway") for size in args.sizes for weather in args.weathers
     ]
-    contenders += [Contender("HighwayVision-v0", 84, "ClearNoon", (name,)) for name in ALL]
+    contenders += [Contender("HighwayVision-v0", 84, "ClearNoon", (name,), "highway") for name in ALL]
+    contenders += [Contender(DRIVEN, 64, "ClearNoon", ALL, scenario) for scenario in SCENARIOS]
     for control_frequency in args.control:
         rows = measure(contenders, control_frequency, args)
         save(rows, args.out, ("vehicles", "control_hz"))

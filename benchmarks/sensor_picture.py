@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from highway_env.vehicle.behavior import IDMVehicle
 
+from benchmarks.rule_driven import RuleDrivenEnv
 from sb3_have.envs import HighwayVisionEnv
 
 
@@ -35,19 +35,9 @@ PICTURES = {
 }
 
 
-class DrivenEnv(HighwayVisionEnv):
-    """highway-env's driver at the wheel, whatever the action."""
-
-    def _reset(self) -> None:
-        super()._reset()
-        ego = self.vehicle
-        self.vehicle = IDMVehicle(self.road, ego.position, ego.heading, ego.speed, target_speed=self.max_speed)
-        self.road.vehicles[0] = self.vehicle
-
-
 def picture(shot: Shot) -> np.ndarray:
     """The same traffic in every weather."""
-    env_class = HighwayVisionEnv if shot.scenario == "highway" else DrivenEnv
+    env_class = HighwayVisionEnv if shot.scenario == "highway" else RuleDrivenEnv
     env: Any = env_class(shot.weather, image_size=128, render_mode="rgb_array", scenario=shot.scenario)
     _, info = env.reset(seed=shot.seed)
     for _ in range(shot.steps):

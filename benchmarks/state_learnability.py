@@ -22,9 +22,9 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from highway_env.envs.common.observation import ObservationType
-from highway_env.vehicle.behavior import IDMVehicle
 from stable_baselines3 import SAC
 
+from benchmarks.rule_driven import RuleDrivenEnv
 from sb3_have.envs.highway_vision import HighwayVisionEnv
 from sb3_have.envs.road import LANE_WIDTH
 from sb3_have.envs.road_shape import SCENARIOS
@@ -98,14 +98,8 @@ class StateEnv(HighwayVisionEnv):
         self.observation_space = self.observation_type.space()
 
 
-class RuleBasedEnv(StateEnv):
-    """An IDM/MOBIL driver at the wheel, whatever the action."""
-
-    def _reset(self) -> None:
-        super()._reset()
-        ego = self.vehicle
-        self.vehicle = IDMVehicle(self.road, ego.position, ego.heading, ego.speed, target_speed=self.max_speed)
-        self.road.vehicles[0] = self.vehicle
+class RuleBasedEnv(RuleDrivenEnv, StateEnv):
+    """An IDM/MOBIL driver at the wheel, and nothing rendered."""
 
 
 Driver = Callable[[np.ndarray], np.ndarray]
