@@ -35,6 +35,7 @@ class Server:
         self.calls: list[str] = []  # every call, "World.tick"
         self.missed = 0  # calls that waited in vain
         self.violations: list[str] = []  # what the real client allows, though it does harm
+        self.timeouts: dict[str, float] = {}  # the last of "calls" and of "ticks" [s]
         self.sent: dict[str, dict[int, Any]] = {}  # type of sensor -> frame -> data
         self.settings = carla.WorldSettings()
         self.frame, self.elapsed, self._last_id = 1000, 37.25, 23
@@ -132,7 +133,7 @@ class Server:
         found = [f"{actor.type_id} {number} lives" for number, actor in self.actors.items()]
         found += [f"{name} is {value}" for name in SETTINGS[:3] if (value := getattr(self.settings, name))]
         managers = self.traffic_managers.items()
-        found += [f"traffic manager at {port} runs" for port, tm in managers if tm._usable and tm._life == self.life]
+        found += [f"traffic manager at {port} runs" for port, tm in managers if tm._runs()]
         return found + self.violations
 
     def join(self) -> None:
@@ -299,3 +300,13 @@ def install(monkeypatch: pytest.MonkeyPatch, *servers: Server) -> None:
 
     monkeypatch.setattr(Client, "_find", staticmethod(find), raising=False)
     monkeypatch.setattr(carla, "Client", Client)
+    new_process(monkeypatch, *servers)
+
+
+def new_process(monkeypatch: pytest.MonkeyPatch, *servers: Server) -> None:
+    """Traffic managers and callbacks have died with the clients' process."""
+    for server in servers:
+        server.traffic_managers.clear()
+        for sensor in server.sensors():
+            sensor._callback = None
+    monkeypatch.setattr(TrafficManager, "_of_this_process", [], raising=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 import zlib
@@ -103,6 +104,10 @@ class Actor:
     def get_velocity(self) -> carla.Vector3D:
         velocity = self._last()[1]
         return carla.Vector3D(velocity.x, velocity.y, velocity.z)
+
+    def _handle(self) -> Actor:
+        """Another handle of the same actor, as lists of actors have them."""
+        return copy.copy(self)
 
     @remote
     def destroy(self) -> bool:
@@ -213,6 +218,11 @@ class Sensor(Actor):
         if self._destroyed:
             raise RuntimeError(DESTROYED)
         self._callback = callback
+
+    def _handle(self) -> Actor:
+        handle = copy.copy(self)
+        handle._callback = None  # only the handle that was told to listen listens
+        return handle
 
     def is_listening(self) -> bool:
         return self._callback is not None

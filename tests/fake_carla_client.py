@@ -48,6 +48,7 @@ class Client:
 
     def set_timeout(self, seconds: float, /) -> None:
         expect(seconds, float)
+        self._server.timeouts["calls"] = seconds
 
     @remote
     def get_client_version(self) -> str:
@@ -68,6 +69,8 @@ class Client:
     @remote
     def load_world(self, map_name: str, reset_settings: bool = True) -> World:
         expect(map_name, str)
+        if any(manager._runs() and manager._synchronous for manager in self._server.traffic_managers.values()):
+            self._server.violations.append("a map was loaded under a synchronous traffic manager")
         self._server.load(map_name.rsplit("/")[-1])
         if reset_settings:
             self._server.settings = carla.WorldSettings()
@@ -92,6 +95,8 @@ class Client:
                 raise NotImplementedError(f"command {command!r}")
             done = self._server.remove(command.actor_id)
             responses.append(Response(command.actor_id, "" if done else "unable to destroy actor: not found"))
+        if do_tick:
+            self._server.tick()
         return responses
 
 
@@ -133,6 +138,7 @@ class World:
     def apply_settings(self, settings: carla.WorldSettings, seconds: float = 0.0, /) -> int:
         expect(settings, carla.WorldSettings)
         expect(seconds, float)
+        run_traffic_managers(self._server)
         self._server.settings = copy_settings(settings)
         return self._server.frame
 
@@ -152,7 +158,7 @@ class World:
     @remote
     def get_actors(self) -> ActorList:
         actors = self._server.actors
-        return ActorList([actors[number] for number in self._server.listed if number in actors])
+        return ActorList([actors[number]._handle() for number in self._server.listed if number in actors])
 
     def get_snapshot(self) -> WorldSnapshot:
         server = self._server
@@ -186,6 +192,8 @@ class World:
         expect(seconds, float)
         if not self._server.settings.synchronous_mode or not self._server.step_length:
             raise AssertionError("tick() without synchronous mode and fixed_delta_seconds")
+        self._server.timeouts["ticks"] = seconds
+        run_traffic_managers(self._server)
         return self._server.tick()
 
 
@@ -244,8 +252,17 @@ def managed(method: Callable[Concatenate[TrafficManager, P], None]) -> Callable[
     return call
 
 
+def run_traffic_managers(server: Server) -> None:
+    """What each tick of any world, and each change of settings, does in the client: the process has all of them."""
+    for manager in TrafficManager._of_this_process:
+        if manager._usable and manager._synchronous and not manager._runs():
+            server.violations.append(f"traffic manager {manager._port} ran without its server: the process would abort")
+
+
 class TrafficManager:
     """Lives in the client's process; its threads end the process when they find that their server is gone."""
+
+    _of_this_process: ClassVar[list[TrafficManager]]  # set by fake_carla.install
 
     def __init__(self, server: Server, port: int) -> None:
         self._server, self._life, self._port = server, server.life, port
@@ -253,6 +270,11 @@ class TrafficManager:
         self._seed: int | None = None
         self._rng = np.random.default_rng()  # without a seed no two runs are the same
         self._speeds: dict[int, float] = {}
+        self._of_this_process.append(self)
+
+    def _runs(self) -> bool:
+        """It was not shut down, and has a server."""
+        return self._usable and self._server.alive and self._life == self._server.life
 
     def _draw(self) -> float:
         """How a vehicle deviates from the speed that it is told, as traffic managers' vehicles do."""

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from fake_carla import Server, install
+from fake_carla import Server, install, new_process
 
 from sb3_have.envs.carla_vision import CarlaVisionEnv, session
 
@@ -20,11 +20,17 @@ Start = Callable[..., CarlaVisionEnv]
 
 def fresh(monkeypatch: pytest.MonkeyPatch) -> Server:
     """A new server of CARLA at localhost:2000."""
-    # ports of traffic managers whose server was lost are remembered by the process
-    monkeypatch.setattr(session, "_dead_ports", set())
     found = Server()
     install(monkeypatch, found)
+    restart_process(monkeypatch, found)
     return found
+
+
+def restart_process(monkeypatch: pytest.MonkeyPatch, server: Server) -> None:
+    """Forget what a process remembers of servers that it drives, and of those that it lost."""
+    monkeypatch.setattr(session, "_drivers", {})
+    monkeypatch.setattr(session, "_lost_with_traffic", [])
+    new_process(monkeypatch, server)
 
 
 @pytest.fixture

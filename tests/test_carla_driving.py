@@ -16,7 +16,7 @@ from fake_carla import Server  # noqa: E402
 from fake_carla_fixtures import ALONE, SMALL, Start, fresh  # noqa: E402
 
 from sb3_have import HAVESAC  # noqa: E402
-from sb3_have.envs.carla_vision import CarlaVisionEnv  # noqa: E402
+from sb3_have.envs.carla_vision import PAPER, CarlaVisionEnv  # noqa: E402
 
 server, start = fake_carla_fixtures.server, fake_carla_fixtures.start
 
@@ -85,7 +85,7 @@ def test_reward_and_distance_by_hand(server: Server, start: Start) -> None:
 
 
 def test_reward_of_highway_vision(server: Server, start: Start) -> None:
-    env = start(**ALONE, reward="highway", steer_cost=0.2, brake_cost=0.5, initial_speed=10.0)
+    env = start(**ALONE, reward="highway", collision_ticks=20, steer_cost=0.2, brake_cost=0.5, initial_speed=10.0)
     server.collide((300.0, 400.0, 0.0))
     _, reward, *_ = env.step(np.array([-0.5, 0.0]))
     speeds = [10 - 0.25 * k for k in (1, 2, 3, 4)]
@@ -136,7 +136,7 @@ def test_initial_speed(server: Server, start: Start) -> None:
 
 
 def test_twenty_colliding_ticks_end_the_episode(server: Server, start: Start) -> None:
-    env = start(**ALONE, crash_penalty=3.0, collision_cost=0.0, standstill_time=None)
+    env = start(**ALONE, crash_penalty=3.0, collision_cost=0.0, standstill_time=math.inf)
     server.collide(*[(1.0, 0.0, 0.0)] * 19)
     for _ in range(5):
         _, reward, terminated, _, info = env.step(STRAIGHT)
@@ -159,12 +159,53 @@ def test_hitting_two_cars_at_once_is_one_colliding_tick(server: Server, start: S
 
 
 def test_collisions_that_are_reported_late_count_too(server: Server, start: Start) -> None:
-    env = start(**ALONE, standstill_time=None)
+    env = start(**ALONE, standstill_time=math.inf)
     server.late("sensor.other.collision", 3)
     server.collide(*[(0.0, 100.0, 0.0)] * 20)
     steps = [env.step(STRAIGHT) for _ in range(6)]
     assert [terminated for _, _, terminated, _, _ in steps] == [False] * 5 + [True]
     assert sum(float(reward) for _, reward, *_ in steps) == pytest.approx(-0.001 * 20 * 100)
+
+
+def test_ends_of_highway_vision(server: Server, start: Start) -> None:
+    env = start(**ALONE, reward="highway")
+    for _ in range(30):  # it may stand still
+        assert not env.step(STRAIGHT)[2]
+    server.collide((0.0, 1.0, 0.0))
+    _, reward, terminated, _, info = env.step(STRAIGHT)
+    assert terminated and info["crashed"] and info["end_reason"] == "crash" and reward == pytest.approx(-20)
+    env = start(**ALONE, reward="highway", collision_ticks=2, standstill_time=0.4)
+    server.collide((0.0, 1.0, 0.0))
+    assert [env.step(STRAIGHT)[2] for _ in range(2)] == [False, True]
+
+
+def test_the_papers_ends(server: Server, start: Start) -> None:
+    paper = {**PAPER, **ALONE, "initial_speed": 10.0}
+    env = start(**paper)
+    server.ego._y += 60
+    for _ in range(3):
+        _, _, terminated, truncated, info = env.step(STRAIGHT)
+        assert info["offroad"] and info["end_reason"] is None and not (terminated or truncated)
+    server.collide(*[(1.0, 0.0, 0.0)] * 20)
+    assert [env.step(STRAIGHT)[2] for _ in range(20)] == [False] * 19 + [True]
+    env.reset()
+    env.step(np.array([-1.0, 0.0]))
+    steps, terminated = 1, False
+    while not terminated:
+        _, _, terminated, _, info = env.step(np.array([-1.0, 0.0]))
+        steps += 1
+    assert info["end_reason"] == "standstill" and steps == pytest.approx(20 * (1 + 5), abs=2)  # 1 s to stop
+    assert env.max_episode_steps == 1000
+
+
+def test_late_collisions_of_before_the_episode_do_not_count(server: Server, start: Start) -> None:
+    server.late("sensor.other.collision", 3)
+    server.collide(*[(1.0, 0.0, 0.0)] * 10)  # the last in the last tick before the episode
+    env = start(**ALONE, collision_ticks=1)
+    assert server.sent["sensor.other.collision"][server.frame]
+    for _ in range(2):
+        _, reward, terminated, *_ = env.step(STRAIGHT)
+        assert reward == 0 and not terminated
 
 
 def test_collisions_before_the_episode_do_not_count(server: Server, start: Start) -> None:
@@ -190,7 +231,7 @@ def test_standing_still_ends_the_episode(server: Server, start: Start) -> None:
     env.reset()
     ends = [env.step(FULL if step % 20 == 10 else np.array([-1.0, 0.0]))[2] for step in range(34)]
     assert not any(ends)
-    env = start(**ALONE, standstill_time=None)
+    env = start(**ALONE, standstill_time=math.inf)
     assert not any(env.step(STRAIGHT)[2] for _ in range(30))
 
 

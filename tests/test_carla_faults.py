@@ -13,10 +13,10 @@ import pytest
 carla = pytest.importorskip("carla", reason="needs the client module of CARLA: pip install 'sb3_have[carla]'")
 
 import fake_carla_fixtures  # noqa: E402
-from fake_carla import Server, install  # noqa: E402
-from fake_carla_fixtures import BRIEF, FULL, fresh, works  # noqa: E402
+from fake_carla import Server  # noqa: E402
+from fake_carla_fixtures import BRIEF, FULL, fresh, restart_process, works  # noqa: E402
 
-from sb3_have.envs.carla_vision import CarlaConnectionError, CarlaVisionEnv  # noqa: E402
+from sb3_have.envs.carla_vision import CarlaConnectionError, CarlaVisionEnv, session  # noqa: E402
 
 server, env = fake_carla_fixtures.server, fake_carla_fixtures.env
 
@@ -101,15 +101,22 @@ def test_an_error_at_any_call_leaves_nothing_behind(monkeypatch: pytest.MonkeyPa
 def test_a_server_may_die_at_any_call(monkeypatch: pytest.MonkeyPatch) -> None:
     for position, server, env in trials(monkeypatch):
         server.die("*", after=position)
-        with pytest.raises(CarlaConnectionError, match=r"localhost:2000.*CarlaUE4.sh.*2000") as caught:
+        with pytest.raises(CarlaConnectionError, match="localhost:2000") as caught:
             drive(env)
-        assert "time-out" in str(caught.value.__cause__)
+        message = str(caught.value)
+        assert ("restart" in message) == bool(session._lost_with_traffic), server.calls[position]
+        if not message.startswith("this process lost"):  # between the episodes
+            assert "CarlaUE4.sh" in message and "time-out" in str(caught.value.__cause__)
         assert server.missed <= 3, "each call to a server that is gone waits for the time-out"
         env.close()
         assert server.missed <= 3
         with pytest.raises(gym.error.ResetNeeded):
             env.step(FULL)
         server.restart()
+        if session._lost_with_traffic:
+            with pytest.raises(CarlaConnectionError, match="restart the process"):
+                env.reset()
+            restart_process(monkeypatch, server)
         works(server, env)
 
 
@@ -171,144 +178,17 @@ def test_an_impatient_ctrl_c_is_made_good_by_the_next_reset(server: Server, env:
     works(server, env)
 
 
-# ---- the server ----
-
-
-def test_no_server(monkeypatch: pytest.MonkeyPatch) -> None:
-    install(monkeypatch)
-    for options in ({}, {"port": 2345}, {"host": "example"}):
-        env = CarlaVisionEnv(**BRIEF, **options)
-        where = f"{options.get('host', 'localhost')}:{options.get('port', 2000)}"
-        with pytest.raises(CarlaConnectionError, match=rf"no CARLA server at {where}.*-carla-rpc-port"):
+def test_two_ctrl_c_one_of_them_right_after_a_spawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    for second, before in (("World.tick", 0), ("World.get_actors", 1), ("Client.apply_batch_sync", 0)):
+        server = fresh(monkeypatch)
+        env = CarlaVisionEnv(**BRIEF)
+        server.fail("World.try_spawn_actor", KeyboardInterrupt(), after=1, done=True)
+        server.fail(second, KeyboardInterrupt(), after=before)
+        with pytest.raises(KeyboardInterrupt):
             env.reset()
+        assert server.actors
         env.close()
-
-
-def test_no_server_for_the_real_client_either() -> None:
-    env = CarlaVisionEnv(**BRIEF, port=2957)
-    with pytest.raises(CarlaConnectionError, match="no CARLA server at localhost:2957"):
-        env.reset()
-
-
-def test_a_server_that_was_restarted_between_episodes(server: Server, env: CarlaVisionEnv) -> None:
-    env.reset(seed=0)
-    server.restart()
-    works(server, env)
-    env.reset()
-    server.restart("Town01")
-    works(server, env)
-    assert server.map.name.endswith("Town04")
-
-
-def test_a_server_that_was_restarted_during_an_episode(server: Server, env: CarlaVisionEnv) -> None:
-    env.reset(seed=0)
-    env.step(FULL)
-    server.restart()
-    with pytest.raises(CarlaConnectionError, match="lost the CARLA server"):
-        env.step(FULL)
-    works(server, env)
-
-
-def test_another_world_was_loaded_between_episodes(server: Server, env: CarlaVisionEnv) -> None:
-    env.reset()
-    carla.Client("localhost", 2000).load_world("Town01")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        works(server, env)
-
-
-def test_another_town_is_loaded_and_an_unknown_one_refused(server: Server) -> None:
-    env = CarlaVisionEnv(**BRIEF, town="Town01")
-    with pytest.raises(ValueError, match=r"no lane .* on road 45"):
-        env.reset()
-    assert server.left_behind() == []
-    env = CarlaVisionEnv(**BRIEF, town="Town01", road_id=7)
-    with pytest.raises(ValueError, match="s = "):  # that road is too short for the traffic
-        while True:
-            env.reset()
-    assert server.left_behind() == []
-    env = CarlaVisionEnv(**BRIEF)
-    env.reset()
-    assert server.map.name == "Carla/Maps/Town04"
-    assert server.calls.count("Client.load_world") == 2
-    env.reset()
-    env.close()
-    assert server.calls.count("Client.load_world") == 2
-    env = CarlaVisionEnv(**BRIEF, town="Town99")
-    with pytest.raises(ValueError, match=r"Town99.*Town01, Town04"):
-        env.reset()
-    assert server.left_behind() == []
-
-
-def test_a_world_that_a_crashed_client_left_synchronous(server: Server, env: CarlaVisionEnv) -> None:
-    crashed = CarlaVisionEnv(**BRIEF)
-    crashed.reset()
-    crashed._finalizer.detach()
-    crashed._session = None
-    server.traffic_managers.clear()  # died with its process
-    with pytest.warns(UserWarning, match="synchronous mode already"):
-        env.reset()
-    assert len(server.vehicles()) == 3
-    env.close()
-    assert server.left_behind() == []
-
-
-def test_settings_and_weather_are_as_before(server: Server) -> None:
-    server.settings.max_culling_distance = 123.0
-    server.settings.no_rendering_mode = True
-    server.settings.fixed_delta_seconds = 0.1
-    server.weather = weather = carla.WeatherParameters.MidRainyNoon
-    env = CarlaVisionEnv(**BRIEF, weather="ClearNight")
-    env.reset()
-    assert not server.settings.no_rendering_mode and server.settings.max_culling_distance == 123
-    env.close()
-    assert not server.settings.synchronous_mode and server.settings.fixed_delta_seconds == pytest.approx(0.1)
-    assert server.settings.no_rendering_mode and server.weather == weather
-
-
-def test_other_versions_are_told(server: Server, env: CarlaVisionEnv) -> None:
-    server.version = "0.9.13"
-    with pytest.warns(UserWarning, match=r"0\.9\.16.*0\.9\.13"):
-        env.reset()
-
-
-def test_a_slow_server_is_not_a_lost_one(server: Server, env: CarlaVisionEnv) -> None:
-    env.reset()
-    server.fail("World.tick", RuntimeError("time-out of 100ms while waiting for the simulator"), after=2)
-    with pytest.raises(TimeoutError, match=r"alive.*0\.1 s.*timeout"):
-        env.step(FULL)
-    assert server.left_behind() == []
-    works(server, env)
-
-
-def test_two_servers_at_a_time(monkeypatch: pytest.MonkeyPatch, server: Server, env: CarlaVisionEnv) -> None:
-    other = Server("Town01", port=2100)
-    install(monkeypatch, server, other)
-    second = CarlaVisionEnv(**BRIEF, port=2100, tm_port=8100)
-    for _ in range(2):
-        env.reset()
-        second.reset()
-        assert env.step(FULL)[4].keys() == second.step(FULL)[4].keys()
-    assert list(server.traffic_managers) == [8000] and list(other.traffic_managers) == [8100]
-    other.die()
-    with pytest.raises(CarlaConnectionError, match="localhost:2100"):
-        second.step(FULL)
-    env.step(FULL)
-    second.close()
-
-
-def test_an_unknown_ego_vehicle(server: Server) -> None:
-    with pytest.raises((ValueError, IndexError), match=r"vehicle\.trabant\.p601"):
-        CarlaVisionEnv(**BRIEF, ego_vehicle="vehicle.trabant.p601").reset()
-    assert server.left_behind() == []
-
-
-def test_a_taken_port_of_the_traffic_manager(server: Server, env: CarlaVisionEnv) -> None:
-    server.fail("Client.get_trafficmanager", RuntimeError("bind error"))
-    with pytest.raises(RuntimeError, match="tm_port"):
-        env.reset()
-    assert server.left_behind() == []
-    works(server, env)
+        assert server.left_behind() == []
 
 
 # ---- spawning ----

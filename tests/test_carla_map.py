@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 else:
     carla = pytest.importorskip("carla", reason="no package carla (wheels for Python 3.10-3.12 on 64-bit Linux)")
 
-from sb3_have.envs.carla_vision.geometry import LIFT, MARGIN, lane_state, spawn_transform
+from sb3_have.envs.carla_vision.episode import LIFT, MARGIN, lane_state, spawn_transform
 
 ROAD, LENGTH, WIDTH, LANES, HEIGHT = 45, 500.0, 3.5, 4, 6.0
 X0, Y0, HEADING = 30.0, -12.0, 0.7  # where the road begins, in OpenDRIVE's axes (y to the left)

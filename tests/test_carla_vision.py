@@ -1,5 +1,6 @@
 """CarlaVision-v0 on the fake server: the contract, what is seen, and who is where."""
 
+import math
 from typing import Any, get_args
 
 import gymnasium as gym
@@ -17,8 +18,9 @@ import fake_carla_fixtures  # noqa: E402
 from fake_carla import Server  # noqa: E402
 from fake_carla_fixtures import ALONE, SMALL, Start  # noqa: E402
 
-from sb3_have.envs import HighwayVisionEnv  # noqa: E402
-from sb3_have.envs.carla_vision import PAPER, CarlaVisionEnv, episode  # noqa: E402
+from sb3_have.envs import HighwayVisionEnv, vision  # noqa: E402
+from sb3_have.envs.carla_vision import PAPER, CarlaVisionEnv, sensors  # noqa: E402
+from sb3_have.envs.vision import compose  # noqa: E402
 from sb3_have.envs.weather import WEATHERS  # noqa: E402
 from sb3_have.sensors import encode_depth  # noqa: E402
 from sb3_have.sensors.representations import Representation  # noqa: E402
@@ -108,6 +110,19 @@ def test_representations_have_the_same_space_in_both(server: Server, start: Star
     assert env.observation_space == HighwayVisionEnv(**options).observation_space
     observation, *_ = env.step(FULL)
     assert env.observation_space.contains(observation) and len(np.unique(observation["event"])) > 2
+    env.render_mode = "rgb_array"
+    np.testing.assert_array_equal(env.render(), compose(observation, representation=env._event["representation"]))
+
+
+def test_options_of_the_event_camera_that_either_spells_out(server: Server, start: Start) -> None:
+    for options in (vision.EVENT_DEFAULTS, sensors.EVENT_DEFAULTS):
+        assert HighwayVisionEnv(event=options).observation_space == CarlaVisionEnv(event=options).observation_space
+    seen = []
+    for tau in (None, 0.2, 0.01):
+        env = start(event={"representation": "time_surface", "tau": tau}, initial_speed=20.0)
+        seen.append(env.step(FULL)[0]["event"])
+    np.testing.assert_array_equal(seen[0], seen[1])
+    assert (seen[2] <= seen[1]).all() and (seen[2] < seen[1]).any()
 
 
 @pytest.mark.parametrize(
@@ -124,6 +139,9 @@ def test_representations_have_the_same_space_in_both(server: Server, start: Star
         ({"standstill_time": 0.0}, "standstill_time"),
         ({"initial_speed": 31.0}, "initial_speed"),
         ({"timeout": -1.0}, "timeout"),
+        ({"event_grace": -1.0}, "event_grace"),
+        ({"standstill_time": math.nan}, "standstill_time"),
+        ({"event": {"representation": "time_surface", "tau": 0.0}}, "tau"),
         ({"event": {"shot_rate": 1.0}}, "shot_rate"),
         ({"event": {"treshold": 1.0}}, "treshold"),
         ({"event": {"mapping": "lin_log"}}, "lin_log"),
@@ -178,12 +196,10 @@ def events_by_hand(server: Server, frames: range, size: int, bins: int, now: int
 
 @pytest.mark.parametrize("threaded", [False, True])
 @pytest.mark.parametrize(("frequency", "bins"), [(5, 5), (5, 3), (20, 5)])
-def test_images_are_those_that_the_server_sent(
-    monkeypatch: pytest.MonkeyPatch, server: Server, frequency: int, bins: int, threaded: bool
-) -> None:
+def test_images_are_those_that_the_server_sent(server: Server, frequency: int, bins: int, threaded: bool) -> None:
     server.threaded = threaded
-    monkeypatch.setattr(episode, "EVENT_GRACE", 5.0)  # a busy machine starts threads late
-    options = {**SMALL, "timeout": 5.0, "policy_frequency": frequency, "event": {"bins": bins}, "initial_speed": 20.0}
+    options = {**SMALL, "policy_frequency": frequency, "event": {"bins": bins}, "initial_speed": 20.0}
+    options.update(timeout=5.0, event_grace=5.0)  # a busy machine starts threads late
     env = CarlaVisionEnv(**options)
     observation, _ = env.reset(seed=0)
     assert (observation["event"] == 128).all() and observation["event"].shape == (16, 16, bins)

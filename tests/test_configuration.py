@@ -13,7 +13,14 @@ from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 from sb3_have import train
 from sb3_have.common.drivers import RandomDriver
 from sb3_have.common.evaluation import evaluate_episodes
-from sb3_have.configuration import config_path, env_wrapper, hyperparameter, load_config, model_kwargs
+from sb3_have.configuration import (
+    config_path,
+    env_wrapper,
+    evaluation_env_kwargs,
+    hyperparameter,
+    load_config,
+    model_kwargs,
+)
 from sb3_have.train import Run
 
 CONFIG: dict[str, Any] = {
@@ -40,11 +47,22 @@ def test_unknown_configuration_is_explained(tmp_path: Path) -> None:
 
 
 def test_one_block_for_both_simulators() -> None:
-    assert load_config("havesac", "CarlaVision-v0") == load_config("havesac", "HighwayVision-v0")
+    ours, theirs = load_config("havesac", "CarlaVision-v0"), load_config("havesac", "HighwayVision-v0")
+    servers = ours.pop("eval_env_kwargs")
+    assert ours == {**theirs, "env_kwargs": {**theirs["env_kwargs"], "reward": "highway"}}
+    assert servers == {"port": 2010, "tm_port": 8010}
+
+
+def test_evaluation_has_keywords_of_its_own() -> None:
+    config = {"env_kwargs": {"weather": "fast", "port": 1, "size": 2}, "eval_env_kwargs": {"port": 3}}
+    assert evaluation_env_kwargs(config) == {"port": 3, "size": 2}
+    assert evaluation_env_kwargs({"eval_env_kwargs": {"weather": "fast", "port": 3}}) == {"port": 3}
+    assert evaluation_env_kwargs({}) == {}
+    assert config["env_kwargs"]["port"] == 1
 
 
 def test_constructor_gets_a_copy_of_what_concerns_it() -> None:
-    kwargs = model_kwargs({**CONFIG, "n_envs": 2, "env_wrapper": SHORT})
+    kwargs = model_kwargs({**CONFIG, "n_envs": 2, "env_wrapper": SHORT, "eval_env_kwargs": {"weather": "slow"}})
     assert set(CONFIG) - set(kwargs) == {"n_timesteps", "frame_stack", "env_kwargs"}
     assert set(kwargs) < set(CONFIG)
     kwargs["policy_kwargs"]["net_arch"].append(1)

@@ -1,6 +1,6 @@
 """CarlaVision-v0, the paper's environment on the CARLA simulator. Importing this needs no ``carla``; a reset does."""
 
 from sb3_have.envs.carla_vision.env import PAPER, CarlaVisionEnv
-from sb3_have.envs.carla_vision.errors import CarlaConnectionError
+from sb3_have.envs.carla_vision.rules import CarlaConnectionError
 
 __all__ = ["PAPER", "CarlaConnectionError", "CarlaVisionEnv"]

@@ -12,12 +12,11 @@ import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from sb3_have.envs.carla_vision.rules import Reward, RewardForm, Trip
-from sb3_have.envs.carla_vision.sensors import dvs_attributes, event_options
+from sb3_have.envs.carla_vision.rules import COLLISION_TICKS, STANDSTILL_TIME, Plan, Reward, RewardForm, Server, Trip
+from sb3_have.envs.carla_vision.sensors import dvs_attributes, event_image, event_options
 from sb3_have.envs.vision import DEPTH_DEFAULTS, MODALITIES, Observation, compose
 from sb3_have.envs.weather import weather_choices
 from sb3_have.sensors.depth import encode_depth
-from sb3_have.sensors.representations import channels
 
 if TYPE_CHECKING:
     from sb3_have.envs.carla_vision.episode import Episode
@@ -34,6 +33,7 @@ PAPER: Final[Mapping[str, Any]] = MappingProxyType(
         "steering_range": None,
         "traffic_speed": None,
         "reward": "paper",
+        "offroad_ends": False,
     }
 )
 
@@ -127,8 +127,9 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
         scenario: str = "highway",
         reward: RewardForm = "paper",
         collision_cost: float | None = None,
-        collision_ticks: int = 20,
-        standstill_time: float | None = 5.0,
+        collision_ticks: int | None = None,
+        standstill_time: float | None = None,
+        offroad_ends: bool = True,
         host: str = "localhost",
         port: int = 2000,
         tm_port: int = 8000,
@@ -136,6 +137,8 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
         road_id: int = 45,
         timeout: float = 10.0,
         ego_vehicle: str = "vehicle.tesla.model3",
+        event_grace: float = 0.02,
+        take_over: bool = False,
     ) -> None:
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"render_mode must be None or 'rgb_array', got {render_mode!r}")
@@ -150,7 +153,7 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
             ("max_episode_steps", 1 if max_episode_steps is None else max_episode_steps, 1),
             ("policy_frequency", policy_frequency, 1),
             ("simulation_frequency", simulation_frequency, 10),
-            ("collision_ticks", collision_ticks, 1),
+            ("collision_ticks", 1 if collision_ticks is None else collision_ticks, 1),
             ("port", port, 1),
             ("tm_port", tm_port, 1024),
         ]:
@@ -161,13 +164,13 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
                 f"simulation_frequency ({simulation_frequency} Hz) must be a multiple of "
                 f"policy_frequency ({policy_frequency} Hz), or control steps would lose time"
             )
-        for name, positive in [
-            ("timeout", timeout),
-            ("steering_range", steering_range),
-            ("standstill_time", standstill_time),
-        ]:
+        for name, positive in [("timeout", timeout), ("steering_range", steering_range)]:
             if positive is not None and not (np.isfinite(positive) and positive > 0):
                 raise ValueError(f"{name} must be positive, got {positive!r}")
+        if standstill_time is not None and not standstill_time > 0:
+            raise ValueError(f"standstill_time must be positive, got {standstill_time!r}")
+        if not (np.isfinite(event_grace) and event_grace >= 0):
+            raise ValueError(f"event_grace must be >= 0, got {event_grace!r}")
         if traffic_speed is not None and (
             np.shape(traffic_speed) != (2,) or not 0 < traffic_speed[0] <= traffic_speed[1]
         ):
@@ -178,36 +181,40 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
         self.weathers = weather_choices(weather)
         self.modalities = tuple(name for name in MODALITIES if name in modalities)
         self.max_episode_steps = max_episode_steps
-        self.collision_ticks, self.standstill_time = int(collision_ticks), standstill_time
+        self.collision_ticks = COLLISION_TICKS[reward] if collision_ticks is None else int(collision_ticks)
+        self.standstill_time = STANDSTILL_TIME[reward] if standstill_time is None else float(standstill_time)
+        self.offroad_ends = bool(offroad_ends)
         self._event, self._depth = event_options(event), _depth_options(depth)
         dvs_attributes(self._event)  # complains about a wrong option now, not at reset
         size = int(image_size)
-        event_channels = channels(self._event["representation"], self._event["bins"])
-        self._plan: dict[str, Any] = {
-            "modalities": self.modalities,
-            "image_size": size,
-            "event": self._event,
-            "depth": self._depth,
-            "vehicles_count": int(vehicles_count),
-            "traffic_speed": None if traffic_speed is None else tuple(float(speed) for speed in traffic_speed),
-            "lanes_count": int(lanes_count),
-            "road_id": int(road_id),
-            "ego_vehicle": ego_vehicle,
-            "initial_speed": float(initial_speed),
-            "max_speed": float(max_speed),
-            "steering_range": None if steering_range is None else float(steering_range),
-        }
-        self._server: dict[str, Any] = {
-            "host": host,
-            "port": int(port),
-            "tm_port": int(tm_port),
-            "town": town,
-            "tick": 1 / int(simulation_frequency),
-            "timeout": float(timeout),
-            "traffic": vehicles_count > 0,
-        }
+        no_events = event_image([], 0, 1.0, size, self._event)  # complains, too
+        self._plan = Plan(
+            modalities=self.modalities,
+            image_size=size,
+            event=self._event,
+            event_grace=float(event_grace),
+            depth=self._depth,
+            vehicles_count=int(vehicles_count),
+            traffic_speed=None if traffic_speed is None else (float(traffic_speed[0]), float(traffic_speed[1])),
+            lanes_count=int(lanes_count),
+            road_id=int(road_id),
+            ego_vehicle=ego_vehicle,
+            initial_speed=float(initial_speed),
+            max_speed=float(max_speed),
+            steering_range=None if steering_range is None else float(steering_range),
+        )
+        self._server = Server(
+            host=host,
+            port=int(port),
+            tm_port=int(tm_port),
+            town=town,
+            tick=1 / int(simulation_frequency),
+            timeout=float(timeout),
+            traffic=vehicles_count > 0,
+            take_over=bool(take_over),
+        )
         self._ticks = int(simulation_frequency // policy_frequency)
-        depths = {"rgb": 3, "event": event_channels, "depth": 1}
+        depths = {"rgb": 3, "event": no_events.shape[-1], "depth": 1}
         self.observation_space: spaces.Space[Any] = spaces.Dict(
             {name: spaces.Box(0, 255, (size, size, depths[name]), np.uint8) for name in self.modalities}
         )
@@ -226,7 +233,7 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
         if self._session is not None:
             return self._session
         try:
-            from sb3_have.envs.carla_vision.session import Server, Session
+            from sb3_have.envs.carla_vision.session import Session
         except ImportError as error:
             if error.name != "carla":
                 raise
@@ -235,7 +242,7 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
                 "3.12 on 64-bit Linux and Windows",
                 name="carla",
             ) from error
-        session = self._session = Session(Server(**self._server))
+        session = self._session = Session(self._server)
         # also when the environment is collected, or the program ends
         self._finalizer = weakref.finalize(self, session.close)
         session.connect()
@@ -249,11 +256,11 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
         except BaseException as error:
             session = self._session
             self.close()
-            if session is None or not isinstance(error, RuntimeError):
+            if session is None or not isinstance(error, RuntimeError | TimeoutError):
                 raise
             if session.lost:
                 raise session.connection_error("lost the CARLA server at") from error
-            if "time-out" in str(error):
+            if isinstance(error, RuntimeError) and "time-out" in str(error):
                 raise TimeoutError(
                     f"the CARLA server is alive but did not finish within {session.server.timeout} s; raise `timeout`"
                 ) from error
@@ -293,9 +300,9 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
         self._trip, self._steps = Trip(), 0
         with self._cleaning_up():
             session = self._connect()
-            from sb3_have.envs.carla_vision.episode import Episode, Plan
+            from sb3_have.envs.carla_vision.episode import Episode
 
-            self._episode = Episode(session, Plan(**self._plan), self.weather, rng)
+            self._episode = Episode(session, self._plan, self.weather, rng)
             self._observation = self._episode.first_observation()
         return self._observation, self._info()
 
@@ -319,7 +326,7 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
         if self._end_reason() is not None:
             gym.logger.warn("step() called after the end of the episode; what it returns is undefined. Call reset().")
         throttle, steer = (float(part) for part in np.clip(action, -1.0, 1.0))
-        dt: float = self._server["tick"]
+        dt: float = self._server.tick
         with self._cleaning_up():
             lanes = [self._episode.tick(throttle, steer) for _ in range(self._ticks)]
             self._observation = self._episode.observation(self._ticks)
@@ -337,7 +344,7 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
     def _end_reason(self) -> str | None:
         reasons = [
             ("crash", self._trip.crashed(self.collision_ticks)),
-            ("offroad", self._trip.offroad),
+            ("offroad", self.offroad_ends and self._trip.offroad),
             ("standstill", self._trip.stuck(self.standstill_time)),
             ("timeout", self.max_episode_steps is not None and self._steps >= self.max_episode_steps),
         ]
@@ -361,7 +368,7 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
             return None
         if self._observation is None:
             raise gym.error.ResetNeeded("nothing to render yet: call reset()")
-        return compose(self._observation)
+        return compose(self._observation, representation=self._event["representation"])
 
 
 def _depth_options(given: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -2,38 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Callable
 from typing import Any, Final, NamedTuple, cast
 
 import carla
+import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
-from sb3_have.envs.carla_vision.geometry import LaneState, lane_state, spawn_transform
 from sb3_have.envs.carla_vision.rules import (
     EGO_RANGE,
     TRAFFIC_RANGE,
     Pedals,
+    Place,
+    Plan,
     draw_place,
     pedals,
     steering_gain,
 )
 from sb3_have.envs.carla_vision.sensors import (
-    EVENT_GRACE,
     Inbox,
     copy_events,
     copy_image,
     decode_depth_image,
-    decode_dvs,
     decode_rgb,
     dvs_attributes,
+    event_image,
     impulse,
 )
 from sb3_have.envs.carla_vision.session import Session
 from sb3_have.envs.vision import Observation
 from sb3_have.sensors.depth import encode_depth
-from sb3_have.sensors.representations import encode_events, represent
 
 #: The roof camera: metres ahead of and above the car's centre on the ground, horizontal field of view [degrees].
 CAMERA: Final = {"x": 1.0, "z": 1.5}
@@ -42,33 +41,20 @@ FIELD_OF_VIEW: Final = 60.0
 ATTEMPTS: Final = 20
 #: Ticks before the episode starts: cars fall onto the road, sensors begin to deliver.
 SETTLING: Final = 10
+#: Cars are put this far above the road and fall onto it: touching it, they would be refused as colliding [m].
+LIFT: Final = 0.3
+#: The centre of a car may be this far beyond the edge of the nearest lane: roads of a map meet with small gaps [m].
+MARGIN: Final = 0.3
 
 _BLUEPRINTS: Final = {"rgb": "sensor.camera.rgb", "depth": "sensor.camera.depth", "event": "sensor.camera.dvs"}
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What an episode consists of; the options of :class:`CarlaVisionEnv` by the same names."""
+class LaneState(NamedTuple):
+    """How a car moves on the nearest driving lane: speed along it [m/s], speed in all [m/s], and whether it left it."""
 
-    modalities: tuple[str, ...]
-    image_size: int
-    event: Mapping[str, Any]
-    depth: Mapping[str, Any]
-    vehicles_count: int
-    traffic_speed: tuple[float, float] | None
-    lanes_count: int
-    road_id: int
-    ego_vehicle: str
-    initial_speed: float
-    max_speed: float
-    steering_range: float | None
-
-
-class Tick(NamedTuple):
-    """What a simulation tick brought."""
-
-    frame: int
-    lane: LaneState
+    lane_speed: float
+    speed: float
+    offroad: bool
 
 
 class Collisions(NamedTuple):
@@ -137,7 +123,7 @@ class Episode:
                 colours = model.get_attribute("color").recommended_values
                 model.set_attribute("color", colours[rng.integers(len(colours))])
             vehicle = self._place(model, TRAFFIC_RANGE, rng, f"vehicle {number} of {plan.vehicles_count}")
-            vehicle.set_autopilot(True, session.tm_port)
+            vehicle.set_autopilot(True, session.server.tm_port)
             if plan.traffic_speed is not None:
                 kmh = 3.6 * float(rng.uniform(*plan.traffic_speed))
                 session.traffic_manager.set_desired_speed(vehicle, kmh)
@@ -161,7 +147,7 @@ class Episode:
         sensor = self.session.spawn(blueprint, transform, self.ego)
         if sensor is None:
             raise RuntimeError(f"the server refused the {inbox.name} sensor ({blueprint.id}); its log says why")
-        cast(carla.Sensor, sensor).listen(inbox)
+        self.session.listen(cast(carla.Sensor, sensor), inbox)
 
     # ---- time ----
 
@@ -174,8 +160,8 @@ class Episode:
                     along = self.ego.get_transform().get_forward_vector()
                     self.ego.set_target_velocity(along * self.plan.initial_speed)
             self.frame = self.session.tick()
+        self._first_frame = self.frame
         self.lane = self._lane()
-        self._collisions.drain()
 
     def tick(self, throttle: float, steer: float) -> LaneState:
         """
@@ -197,16 +183,20 @@ class Episode:
     # ---- sensors ----
 
     def collisions(self) -> Collisions:
-        """Those reported since the last call. One that is reported late counts when it is: none is lost."""
-        reports = self._collisions.drain()
+        """
+        Those of this episode reported since the last call.
+
+        One that is reported late counts when it is, so that none is lost; those of the cars' fall onto the road never.
+        """
+        reports = [report for report in self._collisions.drain() if report[0] > self._first_frame]
         return Collisions(len({frame for frame, _ in reports}), sum(size for _, size in reports))
 
     def first_observation(self) -> Observation:
         """What is seen at the start; no events yet."""
         observation = self._see()
         if self._events is not None:
-            self._events.drain(self.frame, EVENT_GRACE)
-            observation["event"] = self._event_image([], 0, 1)
+            self._events.drain(self.frame, self.plan.event_grace)
+            observation["event"] = event_image([], 0, self._dt, self.plan.image_size, self.plan.event)
         self._begin_step()
         return self._in_order(observation)
 
@@ -215,7 +205,7 @@ class Episode:
         What was seen in a control step.
 
         The image of events holds those of the frames after the last observation. Events that arrive after the images
-        of the last tick and :data:`EVENT_GRACE` are dropped: their step is over.
+        of the last tick and ``event_grace`` are dropped, with a warning the first time: their step is over.
 
         :param ticks: Number of simulation ticks since the last observation.
         :raises TimeoutError: if an image does not come.
@@ -223,10 +213,24 @@ class Episode:
         """
         observation = self._see()
         if self._events is not None:
-            arrays = [data for frame, data in self._events.drain(self.frame, EVENT_GRACE) if frame > self._step_frame]
-            observation["event"] = self._event_image(arrays, self._step_time, ticks)
+            came = self._events.drain(self.frame, self.plan.event_grace)
+            self._tell_of_late(sum(self._first_frame < frame <= self._step_frame for frame, _ in came))
+            arrays = [data for frame, data in came if frame > self._step_frame]
+            observation["event"] = event_image(
+                arrays, self._step_time, ticks * self._dt, self.plan.image_size, self.plan.event
+            )
         self._begin_step()
         return self._in_order(observation)
+
+    def _tell_of_late(self, frames: int) -> None:
+        session = self.session
+        if frames and not session.told_of_late_events:
+            session.told_of_late_events = True
+            gym.logger.warn(
+                f"the events of {frames} ticks came more than event_grace = {self.plan.event_grace} s after their "
+                "control step and were dropped; more may follow, untold. Raise `event_grace`, or add a camera, whose "
+                "images are waited for"
+            )
 
     def _begin_step(self) -> None:
         self._step_frame = self.frame
@@ -243,27 +247,43 @@ class Episode:
             observation["depth"] = encode_depth(metres, *self.plan.depth.values())[..., None]
         return observation
 
-    def _event_image(self, arrays: list[NDArray[np.void]], start: int, ticks: int) -> NDArray[np.uint8]:
-        size, options = self.plan.image_size, self.plan.event
-        duration = ticks * self._dt
-        events = decode_dvs(arrays, start, duration)
-        pixel = events["y"].astype(np.int64) * size + events["x"]
-        values = represent(
-            pixel,
-            events["t"],
-            events["p"].astype(np.float64),
-            options["bins"],
-            0.0,
-            duration,
-            size,
-            size,
-            options["representation"],
-        )
-        return encode_events(values, options["representation"])
-
     def _in_order(self, observation: Observation) -> Observation:
         return {name: observation[name] for name in self.plan.modalities}
 
 
 def _is_car(model: carla.ActorBlueprint) -> bool:
     return model.has_attribute("base_type") and model.get_attribute("base_type").as_str() == "car"
+
+
+def spawn_transform(road_map: carla.Map, road_id: int, place: Place) -> carla.Transform:
+    """
+    Where to put a car.
+
+    :param road_map: The map.
+    :param road_id: OpenDRIVE id of the road.
+    :param place: Lane and arc length.
+    :return: :data:`LIFT` above the centre of the lane, along it.
+    :raises ValueError: if the map has no such place.
+    """
+    waypoint = road_map.get_waypoint_xodr(road_id, place.lane, place.s)
+    if waypoint is None:
+        raise ValueError(
+            f"map {road_map.name} has no lane {place.lane} on road {road_id} at s = {place.s:.1f} m; "
+            "choose another `road_id` or `town`, or fewer lanes (`lanes_count`)"
+        )
+    centre = waypoint.transform.location
+    return carla.Transform(carla.Location(centre.x, centre.y, centre.z + LIFT), waypoint.transform.rotation)
+
+
+def lane_state(road_map: carla.Map, location: carla.Location, velocity: carla.Vector3D) -> LaneState:
+    """
+    :param road_map: The map.
+    :param location: Of the car's centre.
+    :param velocity: Of the car [m/s].
+    """
+    waypoint = road_map.get_waypoint(location)
+    centre, along = waypoint.transform.location, waypoint.transform.get_forward_vector()
+    lane_speed = velocity.x * along.x + velocity.y * along.y + velocity.z * along.z
+    speed = math.sqrt(velocity.x**2 + velocity.y**2 + velocity.z**2)
+    beside = math.hypot(location.x - centre.x, location.y - centre.y)
+    return LaneState(lane_speed, speed, beside > waypoint.lane_width / 2 + MARGIN)

@@ -1,11 +1,11 @@
-"""What a drive in CARLA is worth, when it ends, how actions become pedals, where cars are put. Needs no server."""
+"""A drive in CARLA without CARLA: what it consists of and is worth, when it ends, pedals, places. Needs no client."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple, get_args
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 
@@ -20,6 +20,57 @@ STANDSTILL_SPEED: Final = 0.1
 # Defaults of the weights: the paper's reward knows impulses and no penalty, HighwayVision's the reverse.
 _COLLISION_COST: Final = {"paper": 0.001, "highway": 0.0}
 _CRASH_PENALTY: Final = {"paper": 0.0, "highway": 20.0}
+#: Defaults of the ends: ticks with a collision and seconds without moving; HighwayVision's first collision is its last.
+COLLISION_TICKS: Final = {"paper": 20, "highway": 1}
+STANDSTILL_TIME: Final = {"paper": 5.0, "highway": math.inf}
+
+
+class CarlaConnectionError(ConnectionError):
+    """There is no CARLA server, or it has gone."""
+
+
+@dataclass(frozen=True)
+class Server:
+    """
+    Which server to connect to, and how it is to run.
+
+    :param host: Its name or address.
+    :param port: Its RPC port.
+    :param tm_port: Port for the traffic manager.
+    :param town: The map.
+    :param tick: Length of a simulation tick [s].
+    :param timeout: For every call [s].
+    :param traffic: Whether there will be traffic, and so a traffic manager.
+    :param take_over: Whether to take it from a client that left it in synchronous mode.
+    """
+
+    host: str
+    port: int
+    tm_port: int
+    town: str
+    tick: float
+    timeout: float
+    traffic: bool
+    take_over: bool = False
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What an episode consists of; the options of :class:`CarlaVisionEnv` by the same names."""
+
+    modalities: tuple[str, ...]
+    image_size: int
+    event: Mapping[str, Any]
+    event_grace: float
+    depth: Mapping[str, Any]
+    vehicles_count: int
+    traffic_speed: tuple[float, float] | None
+    lanes_count: int
+    road_id: int
+    ego_vehicle: str
+    initial_speed: float
+    max_speed: float
+    steering_range: float | None
 
 
 @dataclass(frozen=True)
@@ -109,9 +160,9 @@ class Trip(NamedTuple):
         """As many ticks with a collision as end an episode."""
         return self.collisions >= collision_ticks
 
-    def stuck(self, standstill_time: float | None) -> bool:
-        """Has not moved for so long [s]; None: never. Sums of ticks are compared with a margin for rounding."""
-        return standstill_time is not None and self.still > standstill_time - 1e-6
+    def stuck(self, standstill_time: float) -> bool:
+        """Has not moved for so long [s]. Sums of ticks are compared with a margin for rounding."""
+        return self.still > standstill_time - 1e-6
 
 
 class Pedals(NamedTuple):

@@ -12,16 +12,15 @@ from typing import Any, Final, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_have.envs.vision import EVENT_DEFAULTS as HIGHWAY_DEFAULTS
 from sb3_have.sensors.event_camera import EVENT_DTYPE
+from sb3_have.sensors.representations import encode_events, represent
 
 T = TypeVar("T")
 Bytes = NDArray[np.uint8]
 
 #: One event as CARLA sends it; ``t`` is simulation time in nanoseconds.
 DVS_DTYPE: Final = np.dtype([("x", "<u2"), ("y", "<u2"), ("t", "<i8"), ("pol", "?")])
-#: How long to wait for the events of a tick that has ended [s]. A tick without events sends nothing at all, so this is
-#: not a time-out: it passes whenever nothing moves.
-EVENT_GRACE: Final = 0.02
 #: CARLA's depth ends here [m]; what lies beyond, the sky, reads as this.
 DEPTH_FAR: Final = 1000.0
 
@@ -35,16 +34,18 @@ EVENT_DEFAULTS: Final[Mapping[str, Any]] = MappingProxyType(
         "refractory": 0.0,
         "mapping": "log",
         "log_eps": 1e-3,
+        "tau": None,
     }
 )
-# Options of the simulated event camera that CARLA's has no counterpart for, with their value for "absent" and a remedy.
-_ABSENT: Final[Mapping[str, tuple[Any, str]]] = MappingProxyType(
+# Options of HighwayVision-v0's event camera that CARLA's has no counterpart for, with a remedy.
+_ABSENT: Final[Mapping[str, str]] = MappingProxyType(
     {
-        "subframes": (None, "it renders once per simulation tick; raise simulation_frequency instead"),
-        "leak_rate": (0.0, "it has no leak noise; leave it out"),
-        "shot_rate": (0.0, "it has no shot noise; leave it out"),
-        "cutoff_hz": (None, "its photoreceptor has no bandwidth; leave it out"),
-        "seed": (None, "its noise takes no seed; leave it out"),
+        "subframes": "it renders once per simulation tick; raise simulation_frequency instead",
+        "leak_rate": "it has no leak noise; leave it out",
+        "shot_rate": "it has no shot noise; leave it out",
+        "cutoff_hz": "its photoreceptor has no bandwidth; leave it out",
+        "cutoff_intensity": "its photoreceptor has no bandwidth; leave it out",
+        "seed": "its noise takes no seed; leave it out",
     }
 )
 
@@ -112,12 +113,11 @@ class Inbox(Generic[T]):
         """
         items: list[tuple[int, T]] = []
         deadline = time.monotonic() + grace
-        while True:
-            complete = any(got >= frame for got, _ in items)
-            item = self._next(0.0 if complete else deadline)
-            if item is None:
-                return items
+        while (item := self._next(deadline)) is not None:
             items.append(item)
+            if item[0] >= frame:
+                deadline = 0.0  # complete: take what is there, wait no longer
+        return items
 
     def _next(self, deadline: float) -> tuple[int, T] | None:
         try:
@@ -186,17 +186,35 @@ def decode_dvs(arrays: Iterable[NDArray[np.void]], start: int, duration: float) 
     return events
 
 
+def event_image(
+    arrays: Iterable[NDArray[np.void]], start: int, duration: float, size: int, options: Mapping[str, Any]
+) -> Bytes:
+    """
+    The events of a control step as an image.
+
+    :param arrays: See :func:`decode_dvs`, as are ``start`` and ``duration``.
+    :param size: Rows and columns of the sensor.
+    :param options: As :func:`event_options` returns them.
+    :return: uint8 (size, size, C), see :func:`~sb3_have.sensors.representations.encode_events`.
+    """
+    events = decode_dvs(arrays, start, duration)
+    pixel, polarity = events["y"].astype(np.int64) * size + events["x"], events["p"].astype(np.float64)
+    bins, kind, tau = (options[name] for name in ("bins", "representation", "tau"))
+    values = represent(pixel, events["t"], polarity, bins, 0.0, duration, size, size, kind, tau)
+    return encode_events(values, kind)
+
+
 def event_options(given: Mapping[str, Any] | None) -> dict[str, Any]:
     """
     :data:`EVENT_DEFAULTS` with overrides.
 
     :param given: Options as HighwayVision-v0 takes them. Those that CARLA's sensor has no counterpart for may be given
-        only as absent (``leak_rate=0``).
+        only as None or as they are there by default (``leak_rate=0``, ``subframes=5``), and mean nothing.
     :raises ValueError: on an unknown option, or one that CARLA cannot honour.
     """
     given = dict(given or {})
-    for name, (absent, remedy) in _ABSENT.items():
-        if name in given and (value := given.pop(name)) != absent:
+    for name, remedy in _ABSENT.items():
+        if (value := given.pop(name, None)) not in (None, HIGHWAY_DEFAULTS[name]):
             raise ValueError(f"event {name}={value!r} means nothing to CARLA's event camera: {remedy}")
     unknown = set(given) - set(EVENT_DEFAULTS)
     if unknown:

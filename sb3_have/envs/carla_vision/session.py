@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import uuid
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from typing import Final, cast
+from collections.abc import Callable, Iterable
+from contextlib import suppress
+from typing import Any, Final, cast
 
 import carla
 import gymnasium as gym
 
-from sb3_have.envs.carla_vision.errors import CarlaConnectionError
+from sb3_have.envs.carla_vision.rules import CarlaConnectionError, Server
 
 #: Loading a map takes longer than any other call [s].
 LOAD_TIMEOUT: Final = 120.0
@@ -20,31 +19,15 @@ PING_TIMEOUT: Final = 5.0
 #: The roles of all actors begin so.
 ROLE: Final = "sb3_have-"
 
-# Traffic managers live in threads of this process, on ports. One whose server died stays there, unusable.
-_dead_ports: set[int] = set()
-
-
-@dataclass(frozen=True)
-class Server:
-    """
-    Which server to connect to, and how it is to run.
-
-    :param host: Its name or address.
-    :param port: Its RPC port.
-    :param tm_port: Port for the traffic manager; environments of different processes need different ones.
-    :param town: The map.
-    :param tick: Length of a simulation tick [s].
-    :param timeout: For every call [s].
-    :param traffic: Whether there will be traffic, and so a traffic manager.
-    """
-
-    host: str
-    port: int
-    tm_port: int
-    town: str
-    tick: float
-    timeout: float
-    traffic: bool
+# Who drives which server, by host and port: a second session of this process would destroy the first one's actors.
+_drivers: dict[tuple[str, int], Session] = {}
+# Servers that were lost while their traffic manager, threads of this process, ran. It cannot be stopped any more. Every
+# tick of any world, and every change of settings, runs it, and as it does not find its server the process aborts.
+_lost_with_traffic: list[str] = []
+_RESTART: Final = (
+    ", and restart the process, which CARLA's traffic manager would abort at the next tick; a training resumes from "
+    "its checkpoint"
+)
 
 
 class Session:
@@ -64,19 +47,28 @@ class Session:
         self.lost = False
         #: All actors of this session bear it as their role, so that none is overlooked.
         self.role = ROLE + uuid.uuid4().hex
-        self._actors: list[carla.Actor] = []
-        self._spawning = self._connected = self._closing = False
+        self.told_of_late_events = False
+        self._listening: list[carla.Sensor] = []
+        self._connected = self._closing = self._unlisted = False
         #: What puts things right, in the order of the things done; each step may be taken again.
         self._undo: list[Callable[[], object]] = []
 
     def connect(self) -> None:
         """
-        Connect, and take the server over.
+        Connect, and begin to drive the server.
 
-        :raises CarlaConnectionError: if there is none.
+        :raises CarlaConnectionError: if there is none, or this process cannot drive one any more.
+        :raises RuntimeError: if somebody else drives it.
         :raises ValueError: if it does not have the town.
         """
         server = self.server
+        where = f"{server.host}:{server.port}"
+        _refuse_after_a_loss()
+        if _drivers.setdefault((server.host, server.port), self) is not self:
+            raise RuntimeError(
+                f"this process already drives the CARLA server at {where}; give every environment a server of its own: "
+                "port=..., tm_port=..."
+            )
         try:
             self.client = carla.Client(server.host, server.port)
             self.client.set_timeout(server.timeout)
@@ -89,32 +81,45 @@ class Session:
         ours = self.client.get_client_version()
         if ours != theirs:
             gym.logger.warn(
-                f"CARLA client {ours} talks to a server of version {theirs}: calls may fail or mean something else. "
-                f"Install the client of that version: pip install carla=={theirs}"
+                f"CARLA client {ours} talks to a server of version {theirs}: calls may fail or mean something else, "
+                "and images may bear frame numbers that are off by some ticks. Install the client of that version: "
+                f"pip install carla=={theirs}"
             )
         original, weather = self.world.get_settings(), self.world.get_weather()
-        abandoned = original.synchronous_mode
-        if abandoned:
-            gym.logger.warn(
-                f"the CARLA server at {server.host}:{server.port} is in synchronous mode already: another client "
-                "drives it, or died without cleaning up. It will be left in asynchronous mode."
-            )
+        if taken_over := original.synchronous_mode:
+            if not server.take_over:
+                raise RuntimeError(
+                    f"the CARLA server at {where} is in synchronous mode already: another client drives it, or one "
+                    "died without cleaning up. Give every environment a server of its own (port=..., tm_port=...); if "
+                    "nobody else is there, pass take_over=True"
+                )
+            gym.logger.warn(f"took over the CARLA server at {where}; it will be left in asynchronous mode")
             original.synchronous_mode, original.fixed_delta_seconds = False, None
         self._load_town()
         settings = self.world.get_settings()
         settings.synchronous_mode, settings.fixed_delta_seconds = True, server.tick
         settings.no_rendering_mode = False
         # Each step is noted before there is something to undo, so that an interrupt between cannot hide it.
-        self._undo.append(lambda: self.world.apply_settings(original))
+        self._undo.append(lambda: self._restore(original))
         self._undo.append(lambda: self.world.set_weather(weather))
         self.world.apply_settings(settings)
-        self.tm_port = server.tm_port
         if server.traffic:
             self._start_traffic_manager()
-        self._undo.append(self.destroy_actors)
-        if abandoned:
-            self._find_actors(ROLE)  # whoever died may have left some behind
+        self._undo.append(self._destroy)
+        self._undo.append(self._stop_sensors)
+        if taken_over:
+            self._unlisted = True
+            self._destroy(ROLE)  # whoever died may have left some behind
         self.blueprints = self.world.get_blueprint_library()
+
+    def _restore(self, settings: carla.WorldSettings) -> None:
+        if not _lost_with_traffic:
+            self.world.apply_settings(settings)
+            return
+        gym.logger.warn(
+            f"the CARLA server at {self.server.host}:{self.server.port} is left in synchronous mode: restoring it "
+            f"would abort this process, which lost {_lost_with_traffic[0]}. Pass take_over=True to the next environment"
+        )
 
     def _load_town(self) -> None:
         town = self.server.town
@@ -130,22 +135,21 @@ class Session:
         self.road_map = self.world.get_map()
 
     def _start_traffic_manager(self) -> None:
-        while self.tm_port in _dead_ports:
-            self.tm_port += 1
+        port = self.server.tm_port
         self._undo.append(self._stop_traffic_manager)
         try:
-            self.traffic_manager = self.client.get_trafficmanager(self.tm_port)
+            self.traffic_manager = self.client.get_trafficmanager(port)
         except RuntimeError as error:
             self._undo.pop()
             raise RuntimeError(
-                f"no traffic manager on port {self.tm_port}: {error}. If the port is taken, choose another `tm_port`"
+                f"no traffic manager on port {port}: {error}. If the port is taken, choose another `tm_port`"
             ) from error
         self.traffic_manager.set_synchronous_mode(True)
 
     def _stop_traffic_manager(self) -> None:
         # If it ran on it would poll the server, and abort this process when that is shut down. An interrupt right after
         # it was started leaves us without a handle; asking for the port again gives one.
-        manager = self.traffic_manager or self.client.get_trafficmanager(self.tm_port)
+        manager = self.traffic_manager or self.client.get_trafficmanager(self.server.tm_port)
         try:
             manager.set_synchronous_mode(False)
         finally:
@@ -166,51 +170,60 @@ class Session:
         :return: None if something is in the way.
         """
         blueprint.set_attribute("role_name", self.role)
-        with self._noticed():
-            # an Actor or None, whatever the stub says
-            actor: carla.Actor | None = self.world.try_spawn_actor(blueprint, transform, parent)
-            if actor is None:
-                self.client.get_server_version()  # None also stands for a lost connection; this would raise then
-            else:
-                self._actors.append(actor)
+        self._unlisted = True
+        # an Actor or None, whatever the stub says
+        actor: carla.Actor | None = self.world.try_spawn_actor(blueprint, transform, parent)
+        if actor is None:
+            self.client.get_server_version()  # None also stands for a lost connection; this would raise then
         return actor
 
-    @contextmanager
-    def _noticed(self) -> Iterator[None]:
-        """An interrupt between the server's answer and our note of it leaves an actor that only the server knows."""
-        self._spawning = True
-        yield
-        self._spawning = False  # not in a `finally`: an exception leaves it standing for `destroy_actors` to read
+    def listen(self, sensor: carla.Sensor, callback: Callable[[Any], None]) -> None:
+        """
+        Let a sensor send its data, until :meth:`destroy_actors` or :meth:`close`.
+
+        :param sensor: As :meth:`spawn` returned it: only this handle can stop it.
+        :param callback: Called with each datum, from another thread.
+        """
+        self._listening.append(sensor)
+        sensor.listen(callback)
 
     def destroy_actors(self) -> None:
         """Stop and remove every sensor, then every vehicle, of this session."""
-        if self._spawning:
-            self._find_actors(self.role)
-            self._spawning = False
-        self._actors.sort(key=lambda actor: not actor.type_id.startswith("sensor."))  # these first
-        for actor in 2 * self._actors:  # one error is no reason to leave a sensor streaming
-            with suppress(RuntimeError):
-                if actor.type_id.startswith("sensor.") and cast(carla.Sensor, actor).is_listening():
-                    cast(carla.Sensor, actor).stop()
-        if self._actors:
-            destroy = [carla.command.DestroyActor(actor.id) for actor in self._actors]
+        self._stop_sensors()
+        self._destroy()
+
+    def _stop_sensors(self) -> None:
+        while self._listening:
+            if self._listening[-1].is_listening():
+                self._listening[-1].stop()
+            self._listening.pop()
+
+    def _destroy(self, role: str | None = None) -> None:
+        """Remove all actors whose role begins so; the server knows them, even if an interrupt hid them from us."""
+        if self._unlisted:
+            # New actors are listed from the next tick on; a server too slow for one may still remove the others.
+            with suppress(RuntimeError, CarlaConnectionError):
+                self.tick()
+        everybody = cast(Iterable[carla.Actor], self.world.get_actors())
+        ours = [actor for actor in everybody if actor.attributes.get("role_name", "").startswith(role or self.role)]
+        ours.sort(key=lambda actor: not actor.type_id.startswith("sensor."))  # these first
+        if ours:
+            destroy = [carla.command.DestroyActor(actor.id) for actor in ours]
             failures = [reply.error for reply in self.client.apply_batch_sync(destroy, False) if reply.has_error()]
             failures = [failure for failure in failures if "not found" not in failure]  # gone already
             if failures:
                 gym.logger.warn(f"the CARLA server did not remove {len(failures)} actors: {failures[0]}")
-        self._actors.clear()
-
-    def _find_actors(self, role: str) -> None:
-        """Note those of a role, or roles that begin so, that only the server knows."""
-        self.tick()  # new actors are listed from the next tick on
-        known = {actor.id for actor in self._actors}
-        everybody = cast(Iterable[carla.Actor], self.world.get_actors())
-        found = [actor for actor in everybody if actor.attributes.get("role_name", "").startswith(role)]
-        self._actors += [actor for actor in found if actor.id not in known]
 
     def tick(self) -> int:
-        """Let one tick of simulated time pass; its frame."""
-        return self.world.tick(self.server.timeout)
+        """
+        Let one tick of simulated time pass; its frame.
+
+        :raises CarlaConnectionError: if this process has lost a server with traffic, which a tick would not survive.
+        """
+        _refuse_after_a_loss()
+        frame = self.world.tick(self.server.timeout)
+        self._unlisted = False
+        return frame
 
     # ---- ends ----
 
@@ -219,7 +232,7 @@ class Session:
         server = self.server
         return CarlaConnectionError(
             f"{what} {server.host}:{server.port}; start it with "
-            f"`./CarlaUE4.sh -RenderOffScreen -carla-rpc-port={server.port}`"
+            f"`./CarlaUE4.sh -RenderOffScreen -carla-rpc-port={server.port}`" + _RESTART * bool(_lost_with_traffic)
         )
 
     def close(self) -> None:
@@ -229,23 +242,18 @@ class Session:
         A server that has gone is left alone: each call would wait for its time-out, and a traffic manager that cannot
         reach its server aborts the whole process.
 
-        :raises BaseException: an interrupt, after the other steps.
+        :raises BaseException: an interrupt; the steps that it left are for the next call.
         """
         self._closing = True
         if self._connected and not self._alive():
             self._give_up()
-        interrupt: BaseException | None = None
-        for step in reversed(self._undo.copy()):
-            try:
-                if not self.lost:
-                    self._take(step)
-            except BaseException as error:
-                interrupt = interrupt or error
-            else:
-                self._undo = [other for other in self._undo if other is not step]
-        if interrupt is not None:
-            raise interrupt
+        while self._undo:
+            self._take(self._undo[-1])
+            if self._undo:
+                self._undo.pop()
         self._connected = False
+        if _drivers.get(key := (self.server.host, self.server.port)) is self:
+            del _drivers[key]
 
     def _take(self, step: Callable[[], object]) -> None:
         try:
@@ -262,7 +270,7 @@ class Session:
     def _give_up(self) -> None:
         self.lost = True
         if self._stop_traffic_manager in self._undo:
-            _dead_ports.add(self.tm_port)
+            _lost_with_traffic.append(f"{self.server.host}:{self.server.port}")
         self._undo.clear()
 
     def usable(self) -> bool:
@@ -280,3 +288,10 @@ class Session:
         except RuntimeError:
             return False
         return True
+
+
+def _refuse_after_a_loss() -> None:
+    if _lost_with_traffic:
+        raise CarlaConnectionError(
+            f"this process lost the CARLA server at {_lost_with_traffic[0]} while traffic was there{_RESTART}"
+        )
