@@ -50,6 +50,11 @@ def put_index(path: Path, name: str, index: Any) -> None:
         file.create_dataset(name, data=np.asarray(index, dtype="u8"))
 
 
+def put_offset(path: Path, offset: Any) -> None:
+    with h5py.File(path, "a") as file:
+        file["t_offset"] = offset
+
+
 def index_of(ticks: Array) -> Array:
     return np.array([np.flatnonzero(ticks >= 1000 * ms)[0] for ms in range(ticks[-1] // 1000 + 1)])
 

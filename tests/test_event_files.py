@@ -20,6 +20,7 @@ from event_recordings import (
     index_of,
     put,
     put_index,
+    put_offset,
     recording,
     ticks_of,
 )
@@ -32,8 +33,7 @@ def test_a_file_as_dsec_has_it(tmp_path: Path) -> None:
     events["t"] = np.array(DSEC_TIMES) / 1e6
     path = put(tmp_path / "events.h5", events, **hdf5plugin.Blosc(cname="zstd", clevel=1, shuffle=2))
     put_index(path, "ms_to_idx", DSEC_INDEX)
-    with h5py.File(path, "a") as file:
-        file["t_offset"] = np.int64(49_599_300_523)
+    put_offset(path, np.int64(49_599_300_523))
     with EventFile(path) as recorded:
         assert (recorded.group, len(recorded), recorded.height, recorded.width) == ("events", 10, None, None)
         assert recorded.t_offset == 49_599.300523 and recorded.duration == 0.009
@@ -93,12 +93,72 @@ def test_files_that_count_in_seconds(tmp_path: Path, layout: str) -> None:
     assert_same(middle, found[(found["t"] >= 0.02) & (found["t"] < 0.04)])
 
 
+def unix(path: Path, group: str = "events") -> tuple[Array, int]:
+    """A stream in microseconds of Unix time, and the events by a clock that starts with them."""
+    events, now = recording(), 1_506_117_866_250_001
+    put(path, events, group, time="u8")
+    with h5py.File(path, "a") as file:
+        file[f"{group}/t"][:] += np.uint64(now)
+    first = int(ticks_of(events)[0])
+    events["t"] = (ticks_of(events) - first) / 1e6
+    return events, now + first
+
+
+@pytest.mark.parametrize("group", ["events", "prophesee/left"])
+@pytest.mark.parametrize("index", ["none", "from the first event"])
+def test_unix_time_counts_from_the_first_event(tmp_path: Path, index: str, group: str) -> None:
+    events, first = unix(tmp_path / "events.h5", group)
+    if index != "none":
+        name = "ms_to_idx" if group == "events" else f"{group}/ms_map_idx"
+        put_index(tmp_path / "events.h5", name, index_of(ticks_of(events)))
+    with EventFile(tmp_path / "events.h5") as recorded:
+        assert recorded.t_offset == first / 1e6 and recorded.duration == events["t"][-1]
+        assert_same(recorded.read(), events)
+        assert_same(recorded.read(0, 0.03), events[events["t"] < 0.03])
+        windows = list(recorded.windows(0.01))
+        assert windows[0][0] == 0.0
+        assert_same(np.concatenate([inside for *_, inside in windows]), events)
+
+
+@pytest.mark.parametrize("says", ["index", "t_offset"])
+def test_a_file_that_says_where_time_starts_is_taken_at_its_word(tmp_path: Path, says: str) -> None:
+    late = recording()
+    late["t"] = (ticks_of(late) + 350_000) / 1e6  # nothing happens before
+    path = put(tmp_path / "events.h5", late)
+    if says == "index":
+        put_index(path, "ms_to_idx", index_of(ticks_of(late)))
+    else:
+        put_offset(path, np.int64(5_000_000))
+    with EventFile(path) as recorded:
+        assert recorded.t_offset == (5.0 if says == "t_offset" else 0.0)
+        assert len(recorded.read(0.0, 0.35)) == 0
+        assert_same(recorded.read(0.0, 0.36), late[ticks_of(late) < 360_000])
+
+
+@pytest.mark.parametrize("offset", [1.5, np.array([1, 2]), "now"], ids=str)
+def test_an_offset_is_one_integer(tmp_path: Path, offset: Any) -> None:
+    path = put(tmp_path / "events.h5", recording())
+    put_offset(path, offset)
+    with pytest.raises(ValueError, match=r"t_offset in .* must be one integer, of microseconds, got .*round\(1e6"):
+        EventFile(path)
+
+
+def test_only_the_rows_that_are_read_are_checked(tmp_path: Path) -> None:
+    path = damaged(tmp_path / "events.h5", "t back")  # row 100
+    put_offset(path, np.int64(0))
+    events = recording()
+    assert_same(read_events(path, end=events["t"][50]), events[events["t"] < events["t"][50]])
+    with pytest.raises(ValueError, match="steps back after row 99"):
+        read_events(path)
+
+
 @pytest.mark.parametrize("index", ["right", "none", "short", "shifted", "garbage"])
 def test_every_window_is_that_of_a_mask(tmp_path: Path, index: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The index of milliseconds may save reading, it cannot change what is read."""
     monkeypatch.setattr(event_files, "BLOCK", 8)
     events = recording()
     path = put(tmp_path / "events.h5", events)
+    put_offset(path, np.int64(0))
     right = index_of(ticks_of(events))
     rows = {
         "right": right,
@@ -108,7 +168,7 @@ def test_every_window_is_that_of_a_mask(tmp_path: Path, index: str, monkeypatch:
     }
     if index in rows:
         put_index(path, "ms_to_idx", rows[index])
-    edges = sorted({0.0, 0.003, 0.0035, 0.01, 0.059999, 0.07, *events["t"][::9], *np.arange(0, 0.061, 0.004)})
+    edges = sorted({-0.0005, 0.0, 0.003, 0.0035, 0.01, 0.059999, 0.07, *events["t"][::9], *np.arange(0, 0.061, 0.004)})
     with EventFile(path) as recorded:
         for start in edges:
             for end in edges:
@@ -212,6 +272,10 @@ def damaged(path: Path, change: str) -> Path:
         elif change == "t negative":
             del group["t"]
             group["t"] = values.astype("i8") - 10**6
+            file["t_offset"] = np.int64(0)
+        elif change == "t words":
+            del group["t"]
+            group["t"] = values.astype("S8")
         elif change == "x wide":
             group.attrs["height"], group.attrs["width"] = HEIGHT, WIDTH
             group["x"][3] = WIDTH
@@ -233,7 +297,8 @@ def damaged(path: Path, change: str) -> Path:
         ("p missing", r"holds no event stream, .* it holds \['events/t', 'events/x', 'events/y'\]"),
         ("p short", "differ in length, .*truncated"),
         ("t back", "steps back after row 99, from .*; sort the events"),
-        ("t negative", "shift it to start at 0 or later"),
+        ("t negative", r"starts at -0\.99984 s, but its t_offset or index counts from 0; shift it"),
+        ("t words", r"t of 'events' in .* must be numbers, got \|S8"),
         ("p two", r"must be 0 and 1 or -1 and 1, got \[0, 1, 2\]"),
         ("p three", r"must be 0 and 1 or -1 and 1, got \[-1, 0, 1\]"),
         ("x wide", r"x of 'events' .* spans 0..5 in rows 0..333, outside of a width of 5"),

@@ -4,6 +4,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -158,12 +159,17 @@ def test_a_killed_process_leaves_whole_chunks(tmp_path: Path, how: str, kept: in
     path = tmp_path / "events.h5"
     command = [sys.executable, "-c", KILLED, str(path), how]
     assert subprocess.run(command, cwd=Path(__file__).parent.parent, timeout=120).returncode == -signal.SIGKILL
-    with EventFile(path) as recorded:
+    assert not path.exists()
+    left = path.with_name("events.h5.part")
+    with EventFile(left) as recorded:
         assert len(recorded) == kept
         found = recorded.read()
         np.testing.assert_array_equal(found["t"], np.arange(kept) // 30 / 1e3)
         np.testing.assert_array_equal(found["x"], np.arange(kept) // 30 % 4)
         assert_same(recorded.read(0.004, 0.006), found[120:180])
+    with pytest.raises(FileExistsError, match=r"events\.h5\.part exists; move it away"):
+        EventWriter(path, HEIGHT, WIDTH)
+    assert len(read_events(left)) == kept
 
 
 def test_an_empty_recording(tmp_path: Path) -> None:
@@ -184,6 +190,45 @@ def test_a_recording_is_not_replaced_unless_asked(tmp_path: Path) -> None:
     assert_same(read_events(path), recording())
     write_events(path, recording(seed=1), HEIGHT, WIDTH, overwrite=True)
     assert_same(read_events(path), recording(seed=1))
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def interrupt(*args: Any, **kwargs: Any) -> None:
+    raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize("fault", ["refused", "list", "interrupted", "laid out"])
+def test_a_recording_outlives_a_failed_attempt_to_replace_it(
+    tmp_path: Path, fault: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, good = tmp_path / "events.h5", recording()
+    write_events(path, good, HEIGHT, WIDTH)
+    events: Any = {"refused": good[::-1], "list": good.tolist()}.get(fault, good)
+    if fault == "interrupted":
+        monkeypatch.setattr(EventWriter, "_write", interrupt)
+    elif fault == "laid out":
+        monkeypatch.setattr(h5py.Group, "create_dataset", interrupt)
+    with pytest.raises((ValueError, KeyboardInterrupt)):
+        write_events(path, events, HEIGHT, WIDTH, overwrite=True)
+    monkeypatch.undo()
+    assert list(tmp_path.iterdir()) == [path]
+    assert_same(read_events(path), good)
+
+
+def test_an_exception_overwrites_nothing_and_keeps_what_was_appended(tmp_path: Path) -> None:
+    path, old, new = tmp_path / "events.h5", recording(), recording(seed=1)
+    write_events(path, old, HEIGHT, WIDTH)
+    with pytest.raises(ZeroDivisionError), EventWriter(path, HEIGHT, WIDTH, overwrite=True) as writer:
+        writer.append(new)
+        raise ZeroDivisionError
+    assert_same(read_events(path), old)
+    assert_same(read_events(tmp_path / "events.h5.part"), new)
+    with EventWriter(path, HEIGHT, WIDTH, overwrite=True) as writer:
+        writer.append(new)
+        assert_same(read_events(path), old)  # until it is closed
+    writer.discard()  # has nothing left to discard
+    assert_same(read_events(path), new)
+    assert list(tmp_path.iterdir()) == [path]
 
 
 @pytest.mark.parametrize(
@@ -225,3 +270,7 @@ def test_arguments_of_the_writer(tmp_path: Path) -> None:
         EventWriter(path, 4, 4, "m3ed", t_offset=2.0)
     with EventWriter(path, 4, 4) as writer, pytest.raises(ValueError, match="fields x, y, t and p"):
         writer.append(np.zeros(3, dtype=[("x", "u2"), ("y", "u2")]))
+    untyped: Any = recording().tolist()
+    with pytest.raises(ValueError, match=r"got list; use np\.array\(events, EVENT_DTYPE\)"):
+        write_events(tmp_path / "list.h5", untyped, HEIGHT, WIDTH)
+    assert not list(tmp_path.glob("list*"))

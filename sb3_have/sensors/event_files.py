@@ -1,7 +1,6 @@
 """Recorded event streams in HDF5, read into the arrays that :class:`~sb3_have.sensors.EventCamera` yields.
 
-On disk time is counted in whole microseconds, in memory in seconds from the start of the recording. The conventions are
-those of two large data sets, wherever in a file the group lies:
+The conventions are those of two large data sets, wherever in a file the group lies:
 
 - DSEC: ``/events/{x,y,t,p}``, p 0 or 1, ``/ms_to_idx`` (row of the first event at or after each millisecond) and
   ``/t_offset`` (microseconds to add for the clock of the other sensors), compressed with Blosc (Gehrig et al., "DSEC: A
@@ -10,8 +9,16 @@ those of two large data sets, wherever in a file the group lies:
   same group (Chaney et al., "M3ED: Multi-Robot, Multi-Sensor, Multi-Environment Event Dataset", CVPRW 2023;
   https://m3ed.io/data_overview/datafiles/).
 
-Also read: ``{xs,ys,ts,ps}`` and, as in MVSEC, an N x 4 dataset ``events`` with the columns x, y, t, p. In all of them a
-``t`` of integers counts microseconds and one of floats seconds.
+Also read: ``{xs,ys,ts,ps}`` and, as in MVSEC, an N x 4 dataset ``events`` with the columns x, y, t, p.
+
+In all of them a ``t`` of integers counts microseconds and one of floats seconds. In memory times are seconds from the
+start of the recording, which is
+
+- where the file puts it, if its ``t`` are integers and it has a ``t_offset`` or an index of milliseconds that reaches
+  the first event: the times are then those of the file;
+- else, as in files that hold Unix time, the first event. Its time stamp is subtracted, and becomes ``t_offset``.
+
+Either way ``t + t_offset`` is the time by the clock of the recording.
 """
 
 from __future__ import annotations
@@ -70,7 +77,8 @@ class EventFile:
     :raises FileNotFoundError: if there is no such file.
     :raises OSError: on a damaged or truncated file.
     :raises ValueError: on a file that is not HDF5, without a stream or with several, with columns of unequal length,
-        negative times, or a size other than the one given.
+        times before the start that the file declares, columns that are no numbers, a ``t_offset`` that is no integer,
+        or a size other than the one given.
     """
 
     path: Path
@@ -79,8 +87,8 @@ class EventFile:
     #: Rows and columns of the sensor; None where neither the file nor the caller says.
     height: int | None
     width: int | None
-    #: Seconds to add to the times for the clock of the recording: DSEC's ``t_offset``; the first time stamp where the
-    #: file counts in seconds; else 0.
+    #: Seconds to add to the times for the clock of the recording: the file's ``t_offset``; 0 where it has only an
+    #: index; the first time stamp where it has neither.
     t_offset: float
 
     def __init__(
@@ -103,26 +111,42 @@ class EventFile:
                 f"the columns of {self.group!r} in {self.path} differ in length, {lengths}: the recording is "
                 "truncated; cut all of them to the shortest"
             )
+        for name, column in self._columns.items():
+            if column.dataset.dtype.kind not in ("iufb" if name == "p" else "iuf"):
+                raise ValueError(f"{name} of {self.group!r} in {self.path} must be numbers, got {column.dataset.dtype}")
         self._size = lengths["t"]
-        self._counts = self._columns["t"].dataset.dtype.kind in "iu"
         node = self._file[self.group]
         # DSEC keeps index and offset beside the group, M3ED the index inside of it.
         places = (node.parent,) if self._columns["t"].field is not None else (node, node.parent)
-        self._index = _lookup(places, "ms_to_idx", "ms_map_idx") if self._counts else None
-        self.t_offset = 0.0
-        if not self._counts:
-            self.t_offset = self._time(0) if self._size else 0.0
-        elif self._size and self._time(0) < 0:
-            raise ValueError(
-                f"t of {self.group!r} in {self.path} starts at {self._time(0)} s; shift it to start at 0 or later"
-            )
-        elif (offset := _lookup(places, "t_offset")) is not None:
-            self.t_offset = int(np.asarray(offset[()]).item()) / 1e6
+        self._set_clock(_lookup(places, "t_offset"), _lookup(places, "ms_to_idx", "ms_map_idx"))
 
         resolution = _lookup(places[:1], "calib/resolution")
         stored = (None, None) if resolution is None else (int(resolution[1]), int(resolution[0]))
         self.height = self._agreed("height", height, node.attrs.get("height", stored[0]))
         self.width = self._agreed("width", width, node.attrs.get("width", stored[1]))
+
+    def _set_clock(self, offset: Any, index: Any) -> None:
+        """Find out where the times count from, by the rule of this module."""
+        self._counts = self._columns["t"].dataset.dtype.kind in "iu"
+        self._zero: float = 0  # in the unit of t
+        self.t_offset = 0.0
+        first = self._columns["t"][slice(0, 1)].item() if self._size else 0
+        self._index = index if self._counts and index is not None and first <= 1000 * len(index) else None
+        if not self._counts or (offset is None and self._index is None):
+            self._zero, self.t_offset = first, float(first / 1e6 if self._counts else first)
+            return
+        if first < 0:
+            raise ValueError(
+                f"t of {self.group!r} in {self.path} starts at {first / 1e6} s, but its t_offset or index counts from "
+                "0; shift it to start at 0 or later"
+            )
+        if offset is not None:
+            if offset.dtype.kind not in "iu" or offset.size != 1:
+                raise ValueError(
+                    f"t_offset in {self.path} must be one integer, of microseconds, got {offset.dtype} of shape "
+                    f"{offset.shape}; store round(1e6 * seconds)"
+                )
+            self.t_offset = int(np.asarray(offset[()]).item()) / 1e6
 
     def _agreed(self, name: str, given: int | None, stored: Any) -> int | None:
         if stored is None:
@@ -158,10 +182,11 @@ class EventFile:
 
         :param start: In seconds from the start of the recording, without :attr:`t_offset`; None is the first event.
         :param end: Likewise; None is after the last event.
-        :return: Structured array of :data:`~sb3_have.sensors.EVENT_DTYPE`, sorted by time: t in seconds (the
-            microseconds of the file, divided by 1e6), p +1 or -1.
+        :return: Structured array of :data:`~sb3_have.sensors.EVENT_DTYPE`, sorted by time: t in seconds (whole
+            microseconds, divided by 1e6), p +1 or -1.
         :raises ValueError: if start > end, or on rows that are not sorted by time, that lie outside of the sensor, or
-            whose polarities are neither 0 and 1 nor -1 and 1.
+            whose polarities are neither 0 and 1 nor -1 and 1. Only the rows that are read are checked: an event out of
+            its order elsewhere in the file is not found.
         """
         low, high = -math.inf if start is None else start, math.inf if end is None else end
         if not low <= high:
@@ -188,6 +213,9 @@ class EventFile:
         """
         The recording in consecutive windows, in the memory of one: every event from ``start`` on is in exactly one.
 
+        A window is half-open. The representations take events at t1 as well, but there are none: an event on an edge is
+        in the later window only, and so in one image.
+
         :param duration: Length of a window in seconds.
         :param start: Start of the first one in seconds. Windows before the first event are left out.
         :return: Iterator over (t0, t1, the events with t0 <= t < t1), up to the window of the last event; a window in
@@ -213,7 +241,8 @@ class EventFile:
 
     def _seconds(self, rows: slice) -> FloatArray:
         raw = self._columns["t"][rows]
-        return np.asarray(raw / 1e6 if self._counts else raw - self.t_offset, dtype=np.float64)
+        # In integers: the microseconds of Unix time fill a float.
+        return np.asarray((raw.astype(np.int64) - self._zero) / 1e6 if self._counts else raw - self._zero, np.float64)
 
     def _time(self, row: int) -> float:
         return float(self._seconds(slice(row, row + 1))[0])

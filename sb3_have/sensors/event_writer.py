@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -43,9 +44,14 @@ class EventWriter:
     """
     Writes a stream while it is recorded: chunks of events go in, whole chunks of :data:`CHUNK` rows go to disk.
 
-    Use it as a context manager: leaving it, also by an exception, writes the rest. The file is complete and flushed
-    after every chunk, so that a killed process leaves all but the last :data:`CHUNK` events; :meth:`flush` spares these
-    too. Time stamps are rounded to the nearest microsecond, which keeps their order.
+    The file grows beside its place, as ``<path>.part``, and is moved there by :meth:`close`. It is complete and flushed
+    after every chunk, so that a killed process leaves a ``.part`` that can be read, with all but the last :data:`CHUNK`
+    events; :meth:`flush` spares these too.
+
+    Use it as a context manager: leaving it closes the file, also by an exception; but then a file that was to be
+    overwritten stays, and the new one beside it.
+
+    Time stamps are rounded to the nearest microsecond, which keeps their order.
 
     :param path: File to write.
     :param height: Rows of the sensor.
@@ -55,7 +61,7 @@ class EventWriter:
         microseconds. The times themselves count from the start of the recording.
     :param overwrite: Replace a file that is there.
     :raises ImportError: without h5py and hdf5plugin.
-    :raises FileExistsError: if there is a file and ``overwrite`` is false.
+    :raises FileExistsError: if there is a file, or a ``.part`` of an earlier writer, and ``overwrite`` is false.
     :raises ValueError: on an unknown convention, a size outside of 1..65535, or an offset that M3ED has no place for.
     """
 
@@ -76,21 +82,31 @@ class EventWriter:
             raise ValueError(f"t_offset must be a finite number, and 0 for 'm3ed', got {t_offset!r} for {convention!r}")
         h5py = load_h5py()
         self.path = Path(path)
-        if self.path.exists() and not overwrite:
-            raise FileExistsError(f"{self.path} exists; pass overwrite=True to replace it")
+        self._part = self.path.with_name(self.path.name + ".part")
+        for file in (self.path, self._part):
+            if file.exists() and not overwrite:
+                raise FileExistsError(f"{file} exists; move it away, or pass overwrite=True to replace it")
         self.height, self.width = height, width
-        self._layout = layout = _LAYOUTS[convention]
+        self._layout = _LAYOUTS[convention]
         self._pending: list[NDArray[np.void]] = []
         self._last = 0
-        self._file = h5py.File(self.path, "w")
+        self._file = h5py.File(self._part, "w")
+        try:
+            self._lay_out(convention, t_offset)
+        except BaseException:
+            self.discard()
+            raise
+
+    def _lay_out(self, convention: Convention, t_offset: float) -> None:
+        layout = self._layout
         group = self._file.create_group(layout.group)
-        group.attrs["height"], group.attrs["width"] = height, width
+        group.attrs["height"], group.attrs["width"] = self.height, self.width
         compression: dict[str, Any] = {"compression": "lzf"}
         if convention == "dsec":
             compression = dict(import_module("hdf5plugin").Blosc(cname="zstd"))
             self._file.create_dataset("t_offset", data=np.int64(round(t_offset * 1e6)))
         else:
-            group.create_dataset("calib/resolution", data=np.array((width, height), dtype=np.int64))
+            group.create_dataset("calib/resolution", data=np.array((self.width, self.height), dtype=np.int64))
         types = {"x": "u2", "y": "u2", "t": layout.time, "p": layout.polarity}
         self._columns = {
             name: group.create_dataset(name, (0,), dtype, maxshape=(None,), chunks=(CHUNK,), **compression)
@@ -105,7 +121,10 @@ class EventWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        if kind is not None and self.path.exists():
+            self._finish()
+        else:
+            self.close()
 
     def append(self, events: NDArray[np.void]) -> None:
         """
@@ -117,9 +136,10 @@ class EventWriter:
         """
         if not self._file:
             raise ValueError(f"the writer of {self.path} is closed")
-        missing = set(EVENT_DTYPE.names or ()) - set(events.dtype.names or ())
-        if missing:
-            raise ValueError(f"events need the fields x, y, t and p, got dtype {events.dtype}; see EVENT_DTYPE")
+        dtype = getattr(events, "dtype", None)
+        if set(EVENT_DTYPE.names or ()) - set(getattr(dtype, "names", None) or ()):
+            got = type(events).__name__ if dtype is None else f"dtype {dtype}"
+            raise ValueError(f"events need the fields x, y, t and p, got {got}; use np.array(events, EVENT_DTYPE)")
         if not len(events):
             return
         ticks = self._ticks(events["t"])
@@ -177,12 +197,25 @@ class EventWriter:
             self._write(np.concatenate(pending))
 
     def close(self) -> None:
-        """Write the rest and close the file. Closing twice is fine."""
+        """Write the rest, close the file and move it to its place. Closing twice is fine."""
+        if self._finish():
+            os.replace(self._part, self.path)
+
+    def discard(self) -> None:
+        """Close the file and remove it. One that was to be overwritten stays; so does one that is in its place."""
         if self._file:
-            try:
-                self.flush()
-            finally:
-                self._file.close()
+            self._file.close()
+            self._part.unlink(missing_ok=True)
+
+    def _finish(self) -> bool:
+        """Write the rest and close the file, if it is open."""
+        if not self._file:
+            return False
+        try:
+            self.flush()
+        finally:
+            self._file.close()
+        return True
 
 
 def write_events(
@@ -197,11 +230,13 @@ def write_events(
     """
     Write a recording in one go. Parameters and errors as :class:`EventWriter` and :meth:`EventWriter.append`.
 
-    Events that are refused leave no file.
+    Events that are refused leave no file, and one that was to be overwritten as it was.
     """
-    with EventWriter(path, height, width, convention, t_offset, overwrite) as writer:
-        try:
-            writer.append(events)
-        except ValueError:
-            writer.path.unlink()
-            raise
+    writer = EventWriter(path, height, width, convention, t_offset, overwrite)
+    try:
+        writer.append(events)
+        writer.flush()
+    except BaseException:
+        writer.discard()
+        raise
+    writer.close()
