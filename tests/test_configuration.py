@@ -54,7 +54,7 @@ def test_one_block_for_both_simulators() -> None:
 
 
 def test_evaluation_has_keywords_of_its_own() -> None:
-    config = {"env_kwargs": {"weather": "fast", "port": 1, "size": 2}, "eval_env_kwargs": {"port": 3}}
+    config: dict[str, Any] = {"env_kwargs": {"weather": "fast", "port": 1, "size": 2}, "eval_env_kwargs": {"port": 3}}
     assert evaluation_env_kwargs(config) == {"port": 3, "size": 2}
     assert evaluation_env_kwargs({"eval_env_kwargs": {"weather": "fast", "port": 3}}) == {"port": 3}
     assert evaluation_env_kwargs({}) == {}

@@ -13,17 +13,16 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_have.envs.carla_vision.rules import COLLISION_TICKS, STANDSTILL_TIME, Plan, Reward, RewardForm, Server, Trip
-from sb3_have.envs.carla_vision.sensors import dvs_attributes, event_image, event_options
-from sb3_have.envs.vision import DEPTH_DEFAULTS, MODALITIES, Observation, compose
+from sb3_have.envs.carla_vision.sensors import depth_options, dvs_attributes, event_image, event_options
+from sb3_have.envs.vision import MODALITIES, Observation, compose
 from sb3_have.envs.weather import weather_choices
-from sb3_have.sensors.depth import encode_depth
 
 if TYPE_CHECKING:
     from sb3_have.envs.carla_vision.episode import Episode
     from sb3_have.envs.carla_vision.session import Session
 
 #: Options that make ``CarlaVision-v0`` the environment of the paper's experiments: 20 Hz control, the full lock,
-#: traffic at the traffic manager's own speeds.
+#: traffic at the traffic manager's own speeds, ends by 20 colliding ticks, standstill or 1,000 steps only.
 PAPER: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "modalities": ("rgb", "event"),
@@ -44,21 +43,32 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
     Needs the package ``carla`` (extra ``carla``) and a running server, which it connects to at the first ``reset``. The
     server is put into synchronous mode and driven by this environment alone. ``close``, any exception out of ``reset``
     or ``step``, and the end of the program remove what was put there and restore the server's settings; the next
-    ``reset`` connects anew. The map is loaded only if the server has another one. A server may be restarted between
-    episodes; when it dies with traffic on it, CARLA's own traffic manager, a thread of this process, may abort the
-    process at the next tick, which Python cannot prevent (CARLA's issues 4577 and 6748): let something restart long
-    trainings.
+    ``reset`` connects anew. The map is loaded only if the server has another one.
+
+    Every environment needs a server, and with it ``port`` and ``tm_port``, of its own; a second one on the same server
+    is refused. Let each have a process of its own, too (``SubprocVecEnv``): CARLA runs the traffic managers of all
+    environments of a process at every tick of any of them.
+
+    A server may be restarted between episodes without traffic, and with traffic after ``close``. One that is lost with
+    traffic on it leaves CARLA's traffic manager behind, threads of this process that nothing can stop and that abort
+    it at the next tick (CARLA's issues 4577, 6748, 7597): from then on ``reset`` and ``step`` raise until the process
+    is restarted. ``timeout`` bounds all waits for answers and images, but a tick may hang for ever inside the traffic
+    manager (issue 9172, in CARLA 0.9.16): have a watchdog outside of the process restart long trainings.
 
     Observation, action and ``info`` are those of HighwayVision-v0
     (:class:`~sb3_have.envs.highway_vision.HighwayVisionEnv`), with ``end_reason`` "standstill" besides. The ego starts
     on road 45 of Town04, in one of the lanes -1 to -4 at 100 to 110 m, the traffic in those lanes at 114 to 300 m, all
     at rest; CARLA's traffic manager drives it. The camera sits 1 m ahead of and 1.5 m above the car's centre and sees
     60 degrees. An episode is terminated by ``collision_ticks`` simulation ticks with a collision in all ("crash"), by
-    leaving the driving lanes ("offroad") and after ``standstill_time`` without moving; ``max_episode_steps`` truncates
-    it. ``distance`` is the sum of v_s dt. The reward is :class:`~sb3_have.envs.carla_vision.rules.Reward`.
+    leaving the driving lanes ("offroad", see ``offroad_ends``) and after ``standstill_time`` without moving;
+    ``max_episode_steps`` truncates it. ``distance`` is the sum of v_s dt. The reward is
+    :class:`~sb3_have.envs.carla_vision.rules.Reward`.
 
     The same seed gives the same places, cars, colours, speeds and seed of the traffic manager. CARLA's physics and the
     noise of its event camera are its own: whole episodes do not repeat to the bit.
+
+    What only a live server can show was not seen: this was written against CARLA's sources and a simulated server. At
+    night no vehicle's lights are switched on here, and the RGB camera's exposure adapts by itself.
 
     Options that HighwayVision-v0 has too:
 
@@ -67,10 +77,11 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
     :param image_size: height and width of the images [px]
     :param vehicles_count: other vehicles; without any there is no traffic manager either
     :param traffic_speed: range of the speeds the others want to drive at [m/s]; None leaves it to the traffic manager
-        (70% of the limit)
+        (70% of the limit), which may also keep them below some 80 km/h (CARLA's issue 6448)
     :param lanes_count: lanes that cars are put in, from the innermost
     :param max_episode_steps: control steps per episode, or None for no limit
-    :param initial_speed: of the ego vehicle [m/s], in 0 to ``max_speed``
+    :param initial_speed: of the ego vehicle [m/s], in 0 to ``max_speed``. CARLA sets the speed and not the gear
+        (issue 3710), so the car may lose some of it before it pulls
     :param simulation_frequency: [Hz], at least 10 (CARLA's physics) and a multiple of ``policy_frequency``
     :param policy_frequency: control steps per second [Hz]
     :param steering_range: angle of the front wheels at full steering [rad]; None for the vehicle's lock, as in the
@@ -80,8 +91,8 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
     :param brake_cost: reward weight
     :param crash_penalty: reward weight; None: 0 with the paper's reward, 20 with HighwayVision's
     :param event: ``bins``, ``representation``, ``threshold`` (one or a pair: positive, negative), ``threshold_sigma``
-        (CARLA draws it anew for every event), ``refractory`` [s], ``mapping`` ("log", "identity") and ``log_eps`` of
-        the event camera, see :data:`~sb3_have.envs.carla_vision.sensors.EVENT_DEFAULTS`
+        (CARLA draws it anew for every event), ``refractory`` [s], ``mapping`` ("log", "identity"), ``log_eps`` and
+        ``tau`` of the event camera, see :data:`~sb3_have.envs.carla_vision.sensors.EVENT_DEFAULTS`
     :param depth: ``encoding`` and ``max`` as in HighwayVision-v0
     :param render_mode: None or "rgb_array" (RGB | event | depth side by side)
     :param scenario: "highway"; for other roads choose ``town`` and ``road_id``
@@ -90,15 +101,21 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
 
     :param reward: "paper" or "highway"
     :param collision_cost: reward weight, per N s; None: 0.001 with the paper's reward, 0 with HighwayVision's
-    :param collision_ticks: simulation ticks with a collision that end an episode
-    :param standstill_time: seconds below 0.1 m/s in a row that end an episode, also at its start; None: never
+    :param collision_ticks: simulation ticks with a collision that end an episode; None: 20 with the paper's reward, 1
+        with HighwayVision's
+    :param standstill_time: seconds below 0.1 m/s in a row that end an episode, also at its start; infinite: never;
+        None: 5 with the paper's reward, never with HighwayVision's
+    :param offroad_ends: whether leaving the driving lanes ends an episode; not so in the paper
     :param host: of the server
     :param port: of the server
-    :param tm_port: of the traffic manager; each environment needs a server and such a port of its own
+    :param tm_port: of the traffic manager, in this process
     :param town: name of the map
     :param road_id: OpenDRIVE id of the road that cars are put on
     :param timeout: for an answer of the server, a tick or an image [s]
     :param ego_vehicle: blueprint of the ego
+    :param event_grace: how long to wait for the events of a tick that has ended [s]. One without events sends nothing,
+        so this passes whenever nothing moves; events that come later are dropped, with a warning the first time
+    :param take_over: drive a server that is in synchronous mode already, and remove what a client that died left there
     :raises ValueError: for any option outside of what is stated here
     """
 
@@ -184,7 +201,7 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
         self.collision_ticks = COLLISION_TICKS[reward] if collision_ticks is None else int(collision_ticks)
         self.standstill_time = STANDSTILL_TIME[reward] if standstill_time is None else float(standstill_time)
         self.offroad_ends = bool(offroad_ends)
-        self._event, self._depth = event_options(event), _depth_options(depth)
+        self._event, self._depth = event_options(event), depth_options(depth)
         dvs_attributes(self._event)  # complains about a wrong option now, not at reset
         size = int(image_size)
         no_events = event_image([], 0, 1.0, size, self._event)  # complains, too
@@ -285,9 +302,9 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
         :param seed: seeds everything random about this and all following episodes
         :param options: ``{"weather": ...}`` as in the constructor, for this episode only
         :raises ValueError: for other options, an unknown weather, or a map without the road or the lanes asked for
-        :raises ConnectionError: if there is no server
+        :raises ConnectionError: if there is no server, or the process has lost one with traffic
         :raises TimeoutError: if the server is alive and too slow
-        :raises RuntimeError: if there is no room for the cars, or a sensor failed
+        :raises RuntimeError: if somebody else drives the server, there is no room for the cars, or a sensor failed
         """
         unknown = set(options or {}) - {"weather"}
         if unknown:
@@ -369,17 +386,3 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
         if self._observation is None:
             raise gym.error.ResetNeeded("nothing to render yet: call reset()")
         return compose(self._observation, representation=self._event["representation"])
-
-
-def _depth_options(given: Mapping[str, Any] | None) -> dict[str, Any]:
-    unknown = set(given or {}) - set(DEPTH_DEFAULTS)
-    if unknown:
-        raise ValueError(f"unknown depth option {sorted(unknown)}; the options are {', '.join(DEPTH_DEFAULTS)}")
-    options = {**DEPTH_DEFAULTS, **(given or {})}
-    encode_depth(np.empty(0), *options.values())  # complains about a wrong option now, not at reset
-    if options["encoding"] == "log" and "max" in (given or {}):
-        raise ValueError(
-            f"depth max={options['max']!r} has no effect with encoding 'log', whose range is fixed; leave it out or "
-            "choose encoding 'clipped' or 'inverse'"
-        )
-    return options
