@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from sb3_have.sensors import FAILURES, SENSORS, decode_events, failures_for
 from sb3_have.sensors import failures as f
+from sb3_have.sensors.failures import UNSIGNED
 
 Array = NDArray[Any]
 PAIRS = [(kind, sensor) for sensor in SENSORS for kind in failures_for(sensor)]
@@ -137,6 +138,18 @@ def test_a_storm_alternates_from_bin_to_bin_and_is_everywhere() -> None:
     assert (decode_events(corrupt("event_storm", "event", 3, image)) != 0).mean() > 0.99
     flood = f.storm(image, np.random.default_rng(0), 500.0)
     assert set(np.unique(flood)) == {1, 255}  # full scale, and never "no data"
+
+
+def test_unsigned_spurious_events_have_their_rate_too() -> None:
+    image = np.full((200, 200, 5), 128, np.uint8)
+    for kind, rates in (("noise", (0.05, 0.2, 0.8)), ("event_storm", (1.0, 4.0, 16.0))):
+        failure = FAILURES[kind]["event"]
+        for severity, rate in enumerate(rates, 1):
+            parameters = {**failure.at(severity), **UNSIGNED[kind]}
+            counts = decode_events(failure.function(image, np.random.default_rng(severity), **parameters))
+            assert counts.min() >= 0
+            np.testing.assert_allclose(counts.mean(axis=(0, 1)), rate, rtol=0.1)
+            assert counts.var() == pytest.approx(rate, rel=0.05)  # Poisson
 
 
 def test_salt_and_pepper_hit_their_share_of_pixels_in_all_channels() -> None:

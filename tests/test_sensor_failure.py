@@ -1,6 +1,7 @@
 """SensorFailure: what happened is what info says, when it should have happened, and nothing else changed."""
 
 import pickle
+import threading
 from typing import Any
 
 import gymnasium as gym
@@ -266,6 +267,74 @@ def test_keys_tell_the_sensor() -> None:
     for key, sensor in {"dvs_events": "event", "Depth": "depth", "left": "rgb", "event_rate": "vector"}.items():
         assert SensorFailure(Scenes(space), key, "black").sensor == sensor
     assert SensorFailure(Scenes(space), "left", "black", sensor="depth").sensor == "depth"
+
+
+@pytest.mark.parametrize(
+    "key, sensor",
+    [
+        ("event", "event"), ("dvs_events", "event"), ("leftEvents", "event"), ("eventFrame", "event"),
+        ("EVENT_1", "event"), ("depthmap", "depth"), ("front.depth", "depth"), ("leftRGB", "rgb"), ("rgbcam", "rgb"),
+        ("prevention", None), ("inevent", None), ("event_depth", None), ("depth_rgb", None), ("RGBDepth", None),
+    ],
+)  # fmt: skip
+def test_a_key_that_leaves_the_sensor_open_needs_to_be_told(key: str, sensor: str | None) -> None:
+    env = Scenes(spaces.Dict({key: image(3, 20)}))
+    if sensor is not None:
+        assert SensorFailure(env, key, "black").sensor == sensor
+        return
+    with pytest.raises(ValueError, match=f"{key!r} leaves open which sensor .* give sensor="):
+        SensorFailure(env, key, "black")
+    assert SensorFailure(env, key, "black", sensor="rgb").sensor == "rgb"
+
+
+@pytest.mark.parametrize("kind", failures_for("event"))
+def test_unsigned_event_images_stay_unsigned(kind: str) -> None:
+    """As the representations "count", "polarity" and "time_surface" have it, no code falls below "no event"."""
+    space = spaces.Dict({"event": image(6, 20)})
+
+    class Counts(Scenes):
+        def observe(self) -> Any:
+            return {"event": (128 + self.np_random.poisson(1.0, (20, 20, 6))).astype(np.uint8)}
+
+    def seen(**options: Any) -> Array:
+        env = SensorFailure(Counts(space), "event", kind, 3, **options)
+        return np.array([observation["event"] for observation in rollout(env, 6)[0]])
+
+    healthy, signed, unsigned = seen(probability=0.0), seen(), seen(signed=False)
+    assert healthy.min() == unsigned.min() == 128 and (unsigned[1:] != healthy[1:]).any()
+    differs = kind in ("noise", "salt_and_pepper", "event_storm")
+    assert (unsigned != signed).any() == differs and (signed.min() < 128) == differs
+
+
+def test_what_fails_has_nothing_to_do_with_when() -> None:
+    """Were it one stream, the first pixel of every failing reset would be the draw that made it fail."""
+    env = SensorFailure(Scenes(), "rgb", "salt_and_pepper", 3, probability=0.15)
+    struck = []
+    for seed in range(300):
+        observation, info = env.reset(seed=seed)
+        if info["sensor_failure"]["rgb"]["salt_and_pepper"]["active"]:
+            struck.append(np.isin(observation["rgb"][0, 0], (0, 255)).all())
+    assert len(struck) > 20 and 0 < np.mean(struck) < 0.6  # 30% of the pixels
+
+
+class WithLock:
+    """A schedule that cannot be copied."""
+
+    def __init__(self) -> None:
+        self.lock = threading.Lock()
+
+    def __call__(self, step: int) -> bool:
+        with self.lock:
+            return step == 2
+
+
+def test_a_schedule_is_kept_as_it_was_given() -> None:
+    env = SensorFailure(Scenes(), "rgb", "black", schedule=WithLock())
+    assert np.flatnonzero(active(rollout(env, 5)[1])).tolist() == [2]
+    pairs = [[1, 2], [4, None]]
+    env = SensorFailure(Scenes(), "rgb", "black", schedule=pairs)
+    pairs[0][1] = 3
+    assert env._saved_kwargs["schedule"] == ((1, 2), (4, None)) == env.schedule
 
 
 def test_every_kind_was_tried() -> None:

@@ -165,6 +165,17 @@ ODD = spaces.Dict(
         (SPACE, ("rgb", "black"), {"probability": 0.5, "schedule": (0, 2)}, r"either probability or schedule"),
         (SPACE, ("rgb", "black"), {"probability": 1.5}, r"0\.\.1.*1\.5"),
         (SPACE, ("rgb", "black"), {"probability": float("nan")}, r"0\.\.1.*nan"),
+        (SPACE, ("rgb", "black"), {"probability": "0.5"}, r"number in 0\.\.1.*'0\.5'"),
+        (SPACE, ("rgb", "black"), {"probability": True}, r"number in 0\.\.1.*True"),
+        (SPACE, ("rgb", "black"), {"severity": True}, r"severity.*True"),
+        (SPACE, ("rgb", "black"), {"severity": "2"}, r"severity.*'2'"),
+        (SPACE, ("rgb", "black"), {"seed": None}, r"seed must be an integer >= 0, got None"),
+        (SPACE, ("rgb", "black"), {"seed": -1}, r"seed.*-1"),
+        (SPACE, ("rgb", "black"), {"seed": 1.5}, r"seed.*1\.5"),
+        (SPACE, ("rgb", "black"), {"signed": False}, r"signed.*'event', got False for 'rgb'"),
+        (SPACE, ("event", "black"), {"signed": 0}, r"signed.*got 0 for 'event'"),
+        (SPACE, ("rgb", "black"), {"probability": 0.1, "duration": "4"}, r"1 steps or more.*'4'"),
+        (SPACE, ("rgb", "black"), {"schedule": (False, 5)}, r"steps.*False"),
         (SPACE, ("rgb", "black"), {"probability": 0.5, "per": "day"}, r"per must be.*'day'"),
         (SPACE, ("rgb", "black"), {"per": "episode"}, r"per='episode'.*without a probability"),
         (SPACE, ("rgb", "black"), {"duration": 5, "schedule": (1, 2)}, r"duration=5.*without a probability"),
@@ -183,3 +194,12 @@ ODD = spaces.Dict(
 def test_bad_input_is_named(space: Any, args: tuple[Any, ...], kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         SensorFailure(Scenes(space), *args, **kwargs)
+
+
+def test_an_observation_that_is_no_array_is_named() -> None:
+    class Lists(Scenes):
+        def observe(self) -> Any:
+            return {**super().observe(), "state": [0.0] * 6}
+
+    with pytest.raises(ValueError, match=r"'state' should be an array.*got list; return np.array"):
+        SensorFailure(Lists(), "state", "black").reset(seed=0)

@@ -4,8 +4,7 @@ Every function has the form ``f(image, rng, **parameters) -> new image``: it lea
 dtype. The kinds follow the common-corruption benchmarks of robust perception (Hendrycks and Dietterich, "Benchmarking
 Neural Network Robustness to Common Corruptions and Perturbations", ICLR 2019) and what event and depth cameras add;
 the numbers are our own. Images are uint8 (H, W, C) as everywhere in this package: events 128 + signed count with 0 for
-"no data", depth 1..255 with 0 for "nothing there". Spurious events have either sign, as in the "sbt" and "voxel"
-representations.
+"no data", depth 1..255 with 0 for "nothing there".
 """
 
 from __future__ import annotations
@@ -93,10 +92,13 @@ def gaussian_noise(image: Image, rng: Rng, sigma: float) -> Image:
     return _codes(image + sigma * rng.standard_normal(image.shape, np.float32), 0)
 
 
-def spurious_events(image: Image, rng: Rng, rate: float) -> Image:
-    """Events out of thin air, of either sign. ``rate`` expected per pixel and bin; where there is no data stays 0."""
+def spurious_events(image: Image, rng: Rng, rate: float, signed: bool = True) -> Image:
+    """
+    Events out of thin air, of either sign or, if not ``signed``, counted up. ``rate`` expected per pixel and bin; where
+    there is no data stays 0.
+    """
     entries = rng.integers(image.size, size=rng.poisson(rate * image.size))
-    signs = rng.choice((-1.0, 1.0), len(entries))
+    signs = rng.choice((-1.0, 1.0), len(entries)) if signed else np.ones(len(entries))
     return _add_events(image, np.bincount(entries, signs, image.size).reshape(image.shape))
 
 
@@ -179,12 +181,12 @@ def shift(image: Image, rng: Rng, distance: float) -> Image:
     return np.asarray(image[rows[:, None], columns])
 
 
-def storm(image: Image, rng: Rng, rate: float) -> Image:
+def storm(image: Image, rng: Rng, rate: float, signed: bool = True) -> Image:
     """
-    A flickering light floods the sensor: all pixels fire together, brighter in one bin and darker in the next.
-    ``rate`` expected per pixel and bin; where there is no data stays 0.
+    A flickering light floods the sensor: all pixels fire together, brighter in one bin and darker in the next or, if
+    not ``signed``, counted up in all. ``rate`` expected per pixel and bin; where there is no data stays 0.
     """
-    signs = rng.choice((-1, 1)) * (-1) ** np.arange(image.shape[-1])
+    signs = rng.choice((-1, 1)) * (-1) ** np.arange(image.shape[-1]) if signed else 1
     return _add_events(image, signs * rng.poisson(rate, image.shape))
 
 
@@ -229,7 +231,7 @@ _ASKEW: Final = (0.03, 0.06, 0.12)
 #: - ``share``: of the columns (black, frozen), pixels (salt_and_pepper, dead_pixels), patches (depth_dropout) or
 #:   entries of a vector that fail; ``blank``, ``dark``, ``bright``: what they read; ``void``: a code that is spared
 #: - ``sigma``: standard deviation of noise: rgb and depth in codes, vectors in widths of their range
-#: - ``rate``: additional events per pixel and bin
+#: - ``rate``: additional events per pixel and bin, see also :data:`UNSIGNED`
 #: - ``stops``: powers of two of light
 #: - ``length``, ``distance``, ``patch``: in widths of the image
 #: - ``steps``: of the environment
@@ -270,6 +272,14 @@ FAILURES: Final[Mapping[str, Mapping[str, Failure]]] = {
     "misalignment": {sensor: Failure(shift, distance=_ASKEW) for sensor in ("rgb", "event", "depth")},
     "event_storm": {"event": Failure(storm, rate=(1.0, 4.0, 16.0))},
     "depth_dropout": {"depth": Failure(drop_patches, share=(0.1, 0.3, 0.6), patch=1 / 16)},
+}
+
+#: What differs in event images of the representations "count", "polarity" and "time_surface", whose codes do not fall
+#: below "no event": kind -> parameters.
+UNSIGNED: Final[Mapping[str, Mapping[str, Any]]] = {
+    "noise": {"signed": False},
+    "salt_and_pepper": {"dark": EVENT_ZERO},
+    "event_storm": {"signed": False},
 }
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 from collections import deque
 from collections.abc import Callable, Sequence
+from numbers import Integral, Real
 from typing import Any, Literal, get_args
 
 import gymnasium as gym
@@ -12,7 +14,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from sb3_have.sensors.failures import FAILURES, SENSORS, failures_for
+from sb3_have.sensors.failures import FAILURES, SENSORS, UNSIGNED, failures_for
+from sb3_have.sensors.rendering import describe
 
 Array = NDArray[Any]
 Interval = tuple[int, "int | None"]
@@ -71,12 +74,17 @@ class SensorFailure(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
     :param per: What ``probability`` is drawn for, "step" or "episode".
     :param duration: Mean length of a failure in steps, for ``per="step"``; None draws every step on its own.
     :param sensor: "rgb", "event", "depth" or "vector"; None takes a one-dimensional Box of floats for a vector and
-        goes by the key otherwise: "event" or "depth" if it contains that word, else "rgb".
+        goes by the key otherwise: "event" or "depth" if one of its words begins so (``dvs_events``, ``DepthMap``), else
+        "rgb". It must be given where that leaves doubt (``event_depth``, ``prevention``).
     :param seed: Fixes what is a property of the chip and the same in every episode: which pixels are dead, where a
-        misaligned sensor looks.
+        misaligned sensor looks. An integer >= 0.
     :param name: Key in ``info``, the kind by default; to tell two failures of one kind on one modality apart.
+    :param signed: For an event image: whether its codes fall below 128, as in the representations "sbt" and "voxel".
+        With False, for "count", "polarity" and "time_surface", "noise", "event_storm" and "salt_and_pepper" only make
+        events and never negative counts. (A time surface has no counts: there each makes it 1/127 more recent.)
     :raises ValueError: on an unknown modality or kind, a kind that the sensor does not know, an observation that is
-        neither a uint8 (H, W, C) image nor a float vector, or contradictory options.
+        neither a uint8 (H, W, C) image nor a float vector, a key that leaves the sensor in doubt, or impossible or
+        contradictory options.
     """
 
     def __init__(
@@ -92,10 +100,13 @@ class SensorFailure(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         sensor: str | None = None,
         seed: int = 0,
         name: str | None = None,
+        signed: bool = True,
     ) -> None:
+        self.schedule = _checked_schedule(schedule)
         gym.utils.RecordConstructorArgs.__init__(
-            self, modality=modality, kind=kind, severity=severity, probability=probability, schedule=schedule, per=per,
-            duration=duration, sensor=sensor, seed=seed, name=name,
+            self, modality=modality, kind=kind, severity=severity, probability=probability, schedule=self.schedule,
+            per=per, duration=duration, sensor=sensor, seed=seed, name=name, signed=signed,
+            _disable_deepcopy=True,  # a function need not be copyable
         )  # fmt: skip
         gym.Wrapper.__init__(self, env)
         space = _modality_space(env.observation_space, modality)
@@ -108,27 +119,32 @@ class SensorFailure(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
                 f"kind {kind!r} is no failure of a sensor {self.sensor!r}; its kinds are "
                 f"{', '.join(failures_for(self.sensor))} (another sort of sensor: give sensor=...)"
             )
-        if severity not in (1, 2, 3):
+        if not _is(Integral, severity) or severity not in (1, 2, 3):
             raise ValueError(f"severity must be 1, 2 or 3, got {severity!r}")
+        if not _is(Integral, seed) or seed < 0:
+            raise ValueError(f"seed must be an integer >= 0, got {seed!r}")
+        if not isinstance(signed, bool) or not (signed or self.sensor == "event"):
+            raise ValueError(f"signed must be True, or False for a sensor 'event', got {signed!r} for {self.sensor!r}")
         self.severity = int(severity)
         self._refuse_twin(env)
 
         if probability is not None and schedule is not None:
             raise ValueError("give either probability or schedule, not both")
+        if probability is not None and not (_is(Real, probability) and 0 <= probability <= 1):
+            raise ValueError(f"probability must be a number in 0..1, got {probability!r}")
         self.probability = 1.0 if probability is None else float(probability)
-        if not 0 <= self.probability <= 1:
-            raise ValueError(f"probability must lie in 0..1, got {probability!r}")
         if per not in get_args(Per):
             raise ValueError(f"per must be one of {get_args(Per)}, got {per!r}")
         if probability is None and (per != "step" or duration is not None):
             raise ValueError(f"per={per!r} and duration={duration!r} have no effect without a probability")
-        self.schedule = _checked_schedule(schedule)
         self.per, self.duration = per, duration
         if duration is not None:
             self._check_duration(duration)
 
-        self._failure = FAILURES[kind][self.sensor]
-        self._past: deque[Array] = deque(maxlen=1 + int(self._failure.at(self.severity).get("steps", 0)))
+        failure = FAILURES[kind][self.sensor]
+        self._function = failure.function
+        self._parameters = {**failure.at(self.severity), **({} if signed else UNSIGNED.get(kind, {}))}
+        self._past: deque[Array] = deque(maxlen=1 + int(self._parameters.get("steps", 0)))
         self._bounds: dict[str, Array] = {"low": space.low, "high": space.high} if self.sensor == "vector" else {}
         self._stream = zlib.crc32(f"{WHOLE if modality is None else modality}/{self.name}".encode())
         self._chip = np.random.SeedSequence(seed, spawn_key=(self._stream,))
@@ -159,6 +175,11 @@ class SensorFailure(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         self._active = self._happens()
         whole = self.modality is None
         image = observation if whole else observation[self.modality]
+        if not isinstance(image, np.ndarray):
+            raise ValueError(
+                f"observation key {self.modality or WHOLE!r} should be an array, as its space says, got "
+                f"{describe(image)}; return np.array(...) from the environment"
+            )
         seen = self._corrupt(image)
         if self._active:
             observation = seen if whole else {**observation, self.modality: seen}
@@ -190,7 +211,7 @@ class SensorFailure(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             return image
         rng = np.random.default_rng(self._chip) if self.kind in CHIP_KINDS else self._how
         extra = {"past": self._past[0]} if self._past else self._bounds
-        return self._failure.function(image, rng, **extra, **self._failure.at(self.severity))
+        return self._function(image, rng, **extra, **self._parameters)
 
     def _refuse_twin(self, env: gym.Env[Any, Any]) -> None:
         while isinstance(env, gym.Wrapper):
@@ -207,7 +228,7 @@ class SensorFailure(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         if not self.probability < 1:
             raise ValueError("a probability of 1 fails all the time; leave duration out or lower the probability")
         least = max(1.0, self.probability / (1 - self.probability))
-        if not least <= duration < np.inf:
+        if not (_is(Real, duration) and least <= duration < np.inf):
             raise ValueError(
                 f"with probability={self.probability} failures last {least:g} steps or more on average, "
                 f"got duration={duration!r}"
@@ -255,7 +276,17 @@ def _sensor_of(space: spaces.Box, modality: str | None, sensor: str | None) -> s
             f"observation key {key!r} of shape {space.shape} has its channels first; use ChannelLastImages before "
             "SensorFailure"
         )
-    return sensor or next((word for word in ("event", "depth") if word in key.lower()), "rgb")
+    return sensor or _sensor_named(key)
+
+
+def _sensor_named(key: str) -> str:
+    """The sort of image that a key speaks of; complains about a key that may speak of several."""
+    words = [word.lower() for word in re.findall("[A-Z]?[a-z]+|[A-Z]+(?![a-z])", key)]
+    named = [sensor for sensor in ("rgb", "event", "depth") if sensor in key.lower()]
+    clear = [sensor for sensor in named if sensor == "rgb" or any(word.startswith(sensor) for word in words)]
+    if len(named) > 1 or clear != named:
+        raise ValueError(f"observation key {key!r} leaves open which sensor it is; give sensor=, one of {SENSORS[:3]}")
+    return named[0] if named else "rgb"
 
 
 def _checked_schedule(schedule: Schedule | None) -> tuple[Interval, ...] | Callable[[int], bool] | None:
@@ -273,10 +304,14 @@ def _checked_schedule(schedule: Schedule | None) -> tuple[Interval, ...] | Calla
 
 
 def _is_interval(pair: Sequence[Any]) -> bool:
-    whole = (int, np.integer)
-    if len(pair) != 2 or not isinstance(pair[0], whole) or pair[0] < 0:
+    if len(pair) != 2 or not _is(Integral, pair[0]) or pair[0] < 0:
         return False
-    return pair[1] is None or (isinstance(pair[1], whole) and bool(pair[1] > pair[0]))
+    return pair[1] is None or (_is(Integral, pair[1]) and bool(pair[1] > pair[0]))
+
+
+def _is(kind: type, value: Any) -> bool:
+    """Whether this is such a number; a bool is none."""
+    return isinstance(value, kind) and not isinstance(value, bool)
 
 
 def _within(intervals: Sequence[Interval], step: int) -> bool:
