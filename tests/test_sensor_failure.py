@@ -301,7 +301,7 @@ def test_unsigned_event_images_stay_unsigned(kind: str) -> None:
         return np.array([observation["event"] for observation in rollout(env, 6)[0]])
 
     healthy, signed, unsigned = seen(probability=0.0), seen(), seen(signed=False)
-    assert healthy.min() == unsigned.min() == 128 and (unsigned[1:] != healthy[1:]).any()
+    assert healthy.min() == 128 <= unsigned.min() and (unsigned[1:] != healthy[1:]).any()
     differs = kind in ("noise", "salt_and_pepper", "event_storm")
     assert (unsigned != signed).any() == differs and (signed.min() < 128) == differs
 
@@ -331,7 +331,7 @@ class WithLock:
 def test_a_schedule_is_kept_as_it_was_given() -> None:
     env = SensorFailure(Scenes(), "rgb", "black", schedule=WithLock())
     assert np.flatnonzero(active(rollout(env, 5)[1])).tolist() == [2]
-    pairs = [[1, 2], [4, None]]
+    pairs: Any = [[1, 2], [4, None]]
     env = SensorFailure(Scenes(), "rgb", "black", schedule=pairs)
     pairs[0][1] = 3
     assert env._saved_kwargs["schedule"] == ((1, 2), (4, None)) == env.schedule
