@@ -25,7 +25,7 @@ from event_recordings import (
     ticks_of,
 )
 
-from sb3_have.sensors import EVENT_DTYPE, EventFile, event_files, read_events, write_events
+from sb3_have.sensors import EVENT_DTYPE, EventFile, count_frames, event_files, read_events, write_events
 
 
 def test_a_file_as_dsec_has_it(tmp_path: Path) -> None:
@@ -196,6 +196,8 @@ def test_windows_hold_every_event_once(tmp_path: Path) -> None:
             assert all(one[1] == two[0] for one, two in pairwise(windows))
             assert all(((inside["t"] >= t0) & (inside["t"] < t1)).all() for t0, t1, inside in windows)
             assert windows[0][0] == 0.0 and len(windows[-1][2])
+            images = [count_frames(inside, 2, t0, t1, HEIGHT, WIDTH) for t0, t1, inside in windows]
+            assert np.sum(images) == len(events)  # although an image takes events at t1 too
         assert any(not len(inside) for *_, inside in recorded.windows(0.0005))
         assert_same(np.concatenate([w[2] for w in recorded.windows(0.01, start=0.02)]), events[events["t"] >= 0.02])
         assert list(recorded.windows(0.01, start=1.0)) == []

@@ -273,7 +273,7 @@ def test_keys_tell_the_sensor() -> None:
     "key, sensor",
     [
         ("event", "event"), ("dvs_events", "event"), ("leftEvents", "event"), ("eventFrame", "event"),
-        ("EVENT_1", "event"), ("depthmap", "depth"), ("front.depth", "depth"), ("leftRGB", "rgb"), ("rgbcam", "rgb"),
+        ("EVENT_1", "event"), ("depthmap", "depth"), ("front.depth", "depth"), ("leftRGB", "rgb"), ("rgbcam", "rgb"), ("leftrgb", "rgb"),
         ("prevention", None), ("inevent", None), ("event_depth", None), ("depth_rgb", None), ("RGBDepth", None),
     ],
 )  # fmt: skip
