@@ -307,6 +307,7 @@ def new_process(monkeypatch: pytest.MonkeyPatch, *servers: Server) -> None:
     """Traffic managers and callbacks have died with the clients' process."""
     for server in servers:
         server.traffic_managers.clear()
+        server.listed.clear()  # a client knows of no actor before the first tick that it sees
         for sensor in server.sensors():
             sensor._callback = None
     monkeypatch.setattr(TrafficManager, "_of_this_process", [], raising=False)

@@ -178,6 +178,15 @@ def test_an_impatient_ctrl_c_is_made_good_by_the_next_reset(server: Server, env:
     works(server, env)
 
 
+def test_an_error_of_another_kind_is_no_sign_of_death(server: Server, env: CarlaVisionEnv) -> None:
+    env.reset()
+    server.fail("World.tick", KeyboardInterrupt(), after=2)
+    server.fail("Client.get_server_version", RuntimeError("rpc::rpc_error during call"))  # while cleaning up
+    with pytest.raises(KeyboardInterrupt):
+        env.step(FULL)
+    works(server, env)
+
+
 def test_two_ctrl_c_one_of_them_right_after_a_spawn(monkeypatch: pytest.MonkeyPatch) -> None:
     for second, before in (("World.tick", 0), ("World.get_actors", 1), ("Client.apply_batch_sync", 0)):
         server = fresh(monkeypatch)

@@ -281,13 +281,16 @@ class Session:
             return False  # another world has been loaded
 
     def _alive(self) -> bool:
-        try:
-            self.client.set_timeout(min(self.server.timeout, PING_TIMEOUT))
-            self.client.get_server_version()
-            self.client.set_timeout(self.server.timeout)
-        except RuntimeError:
-            return False
-        return True
+        for _ in range(2):  # one error of another kind is no sign of death
+            try:
+                self.client.set_timeout(min(self.server.timeout, PING_TIMEOUT))
+                self.client.get_server_version()
+                self.client.set_timeout(self.server.timeout)
+                return True
+            except RuntimeError as error:
+                if "time-out" in str(error):
+                    break
+        return False
 
 
 def _refuse_after_a_loss() -> None:
