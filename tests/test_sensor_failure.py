@@ -274,7 +274,8 @@ def test_keys_tell_the_sensor() -> None:
     [
         ("event", "event"), ("dvs_events", "event"), ("leftEvents", "event"), ("eventFrame", "event"),
         ("EVENT_1", "event"), ("depthmap", "depth"), ("front.depth", "depth"), ("leftRGB", "rgb"), ("rgbcam", "rgb"),
-        ("leftrgb", "rgb"), ("prevention", None), ("inevent", None), ("event_depth", None), ("depth_rgb", None), ("RGBDepth", None),
+        ("leftrgb", "rgb"), ("prevention", None), ("inevent", None),
+        ("event_depth", None), ("depth_rgb", None), ("RGBDepth", None),
     ],
 )  # fmt: skip
 def test_a_key_that_leaves_the_sensor_open_needs_to_be_told(key: str, sensor: str | None) -> None:
