@@ -18,7 +18,7 @@ BOX = spaces.Box(0, 255, (HEIGHT, WIDTH, 1), np.uint8)
 
 
 def lidar(**kwargs: Any) -> Env:
-    return DepthObservation(MovingBar(observation="dict"), source="lidar", **kwargs)
+    return DepthObservation(MovingBar(observation="dict"), **{"source": "lidar", **kwargs})
 
 
 @pytest.mark.parametrize(
@@ -67,6 +67,17 @@ def test_no_distance_between_two_surfaces_is_made_up() -> None:
     for observation in episode(env):
         assert observation["depth"].shape == (17, 13, 1)
         assert set(np.unique(observation["depth"])) <= {0, *np.unique(encode_depth([5.0, 20.0]))}
+
+
+@pytest.mark.parametrize("size", [20, 27, 80])
+def test_a_smaller_image_shows_things_where_they_are(size: int) -> None:
+    """The nearest pixel of the middle, not of the corner, so that depth and colour lie on each other."""
+    rows, columns = np.indices((240, 240)) - 119.5
+    disc = np.where(rows**2 + columns**2 < 80**2, 5.0, 20.0).astype(np.float32)
+    env = DepthObservation(MovingBar(), lambda env: disc, image_size=size)
+    code = env.reset()[0]["depth"][..., 0]
+    middle = np.argwhere(code == code.min()).mean(axis=0)
+    np.testing.assert_allclose(middle, (size - 1) / 2, atol=0.15)
 
 
 def test_dropout() -> None:
@@ -187,9 +198,19 @@ def nothing(env: Env) -> Any:
             ValueError,
             r"\['sigma'\]; the options are lateral_sigma, baseline_focal",
         ),
+        (lambda: lidar(noise={"disparity_step": "1"}), ValueError, "noise options are numbers, got.*'1'"),
         (lambda: lidar(noise={"disparity_step": -1.0}), ValueError, "disparity_step must be.*-1.0"),
         (lambda: lidar(noise={"baseline_focal": 0.0}), ValueError, "baseline_focal must be.*0.0"),
         (lambda: lidar(image_size=0), ValueError, "image_size"),
+        (lambda: lidar(source=7), ValueError, r"source must be 'render', a key or function\(env\), got 7"),
+        (lambda: lidar(key=5), ValueError, "key must be a string, got 5"),
+        (lambda: lidar(limits=5), ValueError, "limits must be.*got 5"),
+        (lambda: lidar(limits=(0.0, None)), ValueError, r"limits must be.*got \(0.0, None\)"),
+        (lambda: lidar(dropout=None), ValueError, "probability 0..1, got None"),
+        (lambda: lidar(dropout=True), ValueError, "probability 0..1, got True"),
+        (lambda: lidar(noise=True), ValueError, "'redwood'.*got True"),
+        (lambda: lidar(noise=0.1), ValueError, "'redwood'.*got 0.1"),
+        (lambda: lidar(encoding="clipped", maximum="5"), ValueError, "number of metres, got '5'"),
         (lambda: DepthObservation(MovingBar(), nothing), ValueError, "float metres.*got NoneType"),
         (
             lambda: DepthObservation(MovingBar(), lambda env: np.zeros((4, 4), np.uint16)),

@@ -311,13 +311,13 @@ def bar(**kwargs: Any) -> Env:
     [
         (lambda: EventObservation(MovingBar()), ValueError, "got None; pass render_mode='rgb_array' to gym.make"),
         (lambda: EventObservation(MovingBar("human")), ValueError, "'human'; pass render_mode='rgb_array'"),
-        (lambda: bar(source="rgb"), KeyError, r"no key 'rgb', only \['camera', 'grey'"),
-        (lambda: bar(source="position"), ValueError, r"'position' must be a uint8 image.*got Box.*ChannelLastImages"),
+        (lambda: bar(source="rgb"), KeyError, r"no key 'rgb', only \['camera', 'grey'.*name one of them"),
+        (lambda: bar(source="position"), ValueError, r"'position' must be a uint8 image.*got Box.*; make one of it"),
         (lambda: bar(source="lidar"), ValueError, "'lidar' must be a uint8 image"),
         (
             lambda: EventObservation(MovingBar(observation=spaces.Box(0, 255, (3, 8, 8), np.uint8)), "state"),
             ValueError,
-            "ChannelLastImages brings channel-first",
+            "ChannelLastImages brings it into this form",
         ),
         (lambda: bar(key="grey"), ValueError, "key 'grey' already"),
         (lambda: bar(camera={"treshold": 0.3}), ValueError, r"\['treshold'\]; the options are preset, threshold,"),
@@ -335,6 +335,11 @@ def bar(**kwargs: Any) -> Env:
         (lambda: EventObservation(Timeless("rgb_array")), ValueError, r"render_fps.*pass dt=<seconds>"),
         (lambda: bar(source=lambda env: None), ValueError, "must return a frame or a list of them, got None"),
         (lambda: bar(source=lambda env: []), ValueError, r"list of them, got \[\]"),
+        (lambda: bar(source=lambda env: [1.5]), ValueError, "a frame must be uint8.*got float"),
+        (lambda: bar(source=7), ValueError, r"source must be 'render', a key or function\(env\), got 7"),
+        (lambda: bar(key=5), ValueError, "key must be a string, got 5"),
+        (lambda: bar(camera=5), ValueError, "camera must be None.*got 5"),
+        (lambda: bar(dt="0.1"), ValueError, "dt must be.*got '0.1'"),
     ],
 )
 def test_bad_options(make: Callable[[], Env], error: type[Exception], message: str) -> None:

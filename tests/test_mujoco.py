@@ -118,7 +118,8 @@ from sb3_have.sensors import DepthObservation, EventObservation, RenderObservati
 
 def cheetah():
     env = gym.make("HalfCheetah-v5", render_mode="rgbd_tuple", width=36, height=36)
-    return DepthObservation(EventObservation(RenderObservation(env)))
+    env = DepthObservation(EventObservation(RenderObservation(env)))
+    return DepthObservation(env, source=lambda env: np.ones((4, 4), np.float32), key="flat", image_size=4)
 
 env = gym.vector.AsyncVectorEnv([cheetah, cheetah])
 first = env.reset(seed=0)[0]
@@ -137,15 +138,26 @@ def test_worker_processes_render(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
 
 
+@pytest.mark.parametrize("wrapper", [DepthObservation, EventObservation])
+def test_a_function_needs_a_size(wrapper: Any) -> None:
+    """Finding it out would render."""
+    env: Env = gym.make("HalfCheetah-v5", render_mode="rgb_array", width=36, height=36)
+    with pytest.raises(ValueError, match=rf"{wrapper.__name__} of a MuJoCo environment needs image_size="):
+        wrapper(RenderObservation(env), source=lambda env: np.ones((4, 4), np.float32))
+    assert env.unwrapped.mujoco_renderer.viewer is None  # type: ignore[attr-defined]
+
+
 BOX = """
 <mujoco>
   <statistic extent="{extent}"/>
   <visual>
-    <map znear="0.02" zfar="10"/>
+    <map znear="0.02" zfar="20"/>
     <global fovy="4"/>
   </visual>
+  <asset>{sky}</asset>
   <worldbody>
     <camera name="eye" pos="0 0 0" xyaxes="0 -1 0 0 0 1" fovy="60"/>
+    <camera name="wide" pos="0 0 0" xyaxes="0 -1 0 0 0 1" fovy="120"/>
     <camera name="parallel" pos="0 0 0" xyaxes="0 -1 0 0 0 1" fovy="4" projection="orthographic"/>
     <geom type="box" pos="3.5 0.5 0" size="0.5 0.5 1"/>
     <geom type="box" pos="8 -4 0" size="0.25 4 1"/>
@@ -154,14 +166,21 @@ BOX = """
 """
 
 
+SKY = '<texture type="skybox" builtin="gradient" rgb1="0.4 0.6 0.8" rgb2="0 0 0" width="32" height="192"/>'
+
+
+@pytest.mark.parametrize("sky", ["", SKY], ids=["no sky", "skybox"])
 @pytest.mark.parametrize("extent", [1.0, 4.0])
-@pytest.mark.parametrize("camera", ["eye", "parallel", None])
-def test_depth_of_a_known_scene(tmp_path: Path, extent: float, camera: str | None) -> None:
-    """A camera at the origin looks along x: a box from 3 m on to the left, a wall at 7.75 m to the right, sky above."""
+@pytest.mark.parametrize("camera", ["eye", "wide", "parallel", None])
+def test_depth_of_a_known_scene(tmp_path: Path, extent: float, camera: str | None, sky: str) -> None:
+    """
+    A camera at the origin looks along x: a box from 3 m on to the left, a wall at 7.75 m to the right, sky above. A
+    skybox is drawn as a wall, whose depth in the corners of a wide view is less than half of that in the middle.
+    """
     from gymnasium.envs.mujoco import MujocoEnv
 
     model = tmp_path / "boxes.xml"
-    model.write_text(BOX.format(extent=extent))
+    model.write_text(BOX.format(extent=extent, sky=sky))
 
     class Boxes(MujocoEnv):
         metadata = {"render_modes": ["depth_array", "rgbd_tuple"]}  # noqa: RUF012
@@ -187,6 +206,10 @@ def test_depth_of_a_known_scene(tmp_path: Path, extent: float, camera: str | Non
     env = DepthObservation(Boxes(), encoding="clipped", maximum=25.4)
     depth = decode_depth(env.reset(seed=0)[0]["depth"], "clipped", 25.4)[..., 0]
     step = 0.1  # of the code
+    if camera == "wide":
+        assert depth[32, 30] == pytest.approx(3.0, abs=step) and depth[32, 40] == pytest.approx(7.75, abs=step)
+        assert (depth[:20] == 0).all() and (depth[-20:] == 0).all() and (depth[:, :16] == 0).all()
+        return
     assert depth[32, 27] == pytest.approx(3.0, abs=step)
     assert depth[32, 40] == pytest.approx(7.75, abs=step)  # its distance along the axis, not along the ray
     assert depth[32, 55] == pytest.approx(7.75, abs=step)
@@ -196,4 +219,31 @@ def test_depth_of_a_known_scene(tmp_path: Path, extent: float, camera: str | Non
     else:
         assert (depth[16:48, 16:32] > 0).all()  # 1 m is 16 pixels wherever it is
         assert (depth == 0).sum() == 64**2 - 32 * 16 - 32 * 32
+    env.close()
+
+
+@pytest.mark.parametrize("env_id, camera", [("Hopper-v5", None), ("Hopper-v5", "track"), ("Walker2d-v5", "track")])
+def test_the_sky_of_a_stock_model_is_nothing(env_id: str, camera: str | None) -> None:
+    """Against rays cast from the camera: where they hit nothing, and nowhere else, there is nothing."""
+    mujoco = pytest.importorskip("mujoco")
+    made: Env = gym.make(env_id, render_mode="rgbd_tuple", width=48, height=48, camera_name=camera)
+    env = DepthObservation(made)
+    code = env.reset(seed=0)[0]["depth"][..., 0]
+    base: Any = env.unwrapped
+    eye = base.mujoco_renderer.viewer.scn.camera[0]
+    forward, up = np.array(eye.forward, np.float64), np.array(eye.up, np.float64)
+    # The frustum of a pixel's middle; the view is square and centred.
+    rows, columns = (2 * (np.indices((48, 48)) + 0.5) / 48 - 1) * eye.frustum_top / eye.frustum_near
+    rays = forward - rows[..., None] * up + columns[..., None] * np.cross(forward, up)
+    free = np.empty((48, 48), bool)
+    for pixel in np.ndindex(48, 48):
+        hit = np.zeros(1, np.int32)
+        start = np.array(eye.pos, np.float64)
+        free[pixel] = mujoco.mj_ray(base.model, base.data, start, rays[pixel], None, True, -1, hit, None) < 0
+    assert 0.1 < free.mean() < 0.9
+    edge = np.zeros_like(free)
+    for axis in (0, 1):
+        for shift in (-1, 1):
+            edge |= free != np.roll(free, shift, axis)
+    np.testing.assert_array_equal((code == 0)[~edge], free[~edge])
     env.close()

@@ -151,8 +151,9 @@ def test_render_shows_the_present() -> None:
     env = RenderObservation(MovingBar("rgb_array"))
     first = env.reset()[0]["rgb"]
     shown = env.render()
-    shown[:] = 0  # what a user does to a rendering is no business of the observation
+    shown[:] = 0  # what a user does to a rendering is no business of the observation, nor of the next one who looks
     assert (first == picture(0)).all()
+    np.testing.assert_array_equal(env.render(), picture(0))
     env.step(np.zeros(2))
     np.testing.assert_array_equal(env.render(), picture(1))
     env.reset()
@@ -274,6 +275,11 @@ def test_channel_last_images() -> None:
         (lambda: RenderObservation(MovingBar("rgb_array"), image_size=0), ValueError, "image_size.*got 0"),
         (lambda: RenderObservation(MovingBar("rgb_array"), image_size=8.5), ValueError, "image_size.*8.5"),  # type: ignore[arg-type]
         (lambda: RenderObservation(MovingBar("rgb_array"), image_size=(8, 8, 3)), ValueError, r"\(8, 8, 3\)"),  # type: ignore[arg-type]
+        (lambda: DictObservation(MovingBar(), key=5), ValueError, "key must be a string, got 5"),  # type: ignore[arg-type]
+        (lambda: SelectModalities(MovingBar(observation="dict"), 5), ValueError, "list of keys, got 5"),  # type: ignore[arg-type]
+        (lambda: ChannelLastImages(MovingBar(observation="dict"), 5), ValueError, "list of keys, got 5"),  # type: ignore[arg-type]
+        (lambda: RenderObservation(MovingBar("rgb_array"), 5), ValueError, "key must be a string, got 5"),  # type: ignore[arg-type]
+        (lambda: RenderObservation(MovingBar("rgb_array"), image_size=True), ValueError, "image_size.*True"),
         (lambda: DictObservation(MovingBar(observation="dict")), ValueError, "Dict already.*lidar"),
         (lambda: SelectModalities(MovingBar(), ["rgb"]), ValueError, "DictObservation first"),
         (lambda: SelectModalities(MovingBar(observation="dict"), ["rgb"]), KeyError, "no key 'rgb', only.*lidar"),
@@ -282,7 +288,11 @@ def test_channel_last_images() -> None:
         (lambda: ChannelLastImages(MovingBar()), ValueError, r"no image of three sizes.*Box"),
         (lambda: ChannelLastImages(MovingBar(observation="dict"), ["rgb"]), KeyError, "no key 'rgb', only.*lidar"),
         (lambda: ChannelLastImages(MovingBar(observation="dict"), "grey"), ValueError, "list of keys, got 'grey'"),
-        (lambda: ChannelLastImages(MovingBar(observation="dict"), ["lidar"]), ValueError, "'lidar'.*bounds 0..1"),
+        (
+            lambda: ChannelLastImages(MovingBar(observation="dict"), ["lidar"]),
+            ValueError,
+            "'lidar'.*bounds must be 0..1",
+        ),
         (lambda: ChannelLastImages(MovingBar(observation="dict"), ["position"]), ValueError, r"'position'.*\(H, W\)"),
         (
             lambda: ChannelLastImages(MovingBar(observation=spaces.Box(0, 255, (9, 3, 8), np.uint8)), ["state"]),
@@ -306,12 +316,38 @@ class TextEnv(MovingBar):
         (np.full((4, 4, 1), 1.5, np.float32), r"'state' is declared within 0..1 and holds .*1.5.*clip it"),
         (np.full((4, 4, 1), -0.1, np.float32), "-0.1"),
         (np.full((4, 4, 1), np.nan, np.float32), "nan"),
-        (np.zeros((4, 5, 1), np.float32), r"should have shape \(4, 4, 1\), got float32 \(4, 5, 1\)"),
+        (np.zeros((4, 5, 1), np.float32), r"should be float32 \(4, 4, 1\), as its space says, got float32 \(4, 5, 1\)"),
     ],
 )
 def test_float_images_out_of_range(image: Any, message: str) -> None:
     env = ChannelLastImages(Images(spaces.Box(0.0, 1.0, (4, 4, 1), np.float32), image))
     with pytest.raises(ValueError, match=message):
+        env.reset()
+
+
+@pytest.mark.parametrize(
+    "image, message",
+    [
+        (np.full((3, 8, 8), 0.7), r"should be uint8 \(3, 8, 8\), as its space says, got float64 \(3, 8, 8\)"),
+        (np.full((3, 8, 8), 300), r"got int64 \(3, 8, 8\)"),
+        ([[[0]]], "got list"),
+    ],
+)
+def test_images_of_another_number(image: Any, message: str) -> None:
+    env = ChannelLastImages(Images(spaces.Box(0, 255, (3, 8, 8), np.uint8), image))
+    with pytest.raises(ValueError, match=message):
+        env.reset()
+
+
+def test_masks_and_whole_numbers_are_scaled_too() -> None:
+    mask = np.eye(8, dtype=np.uint8)[None]
+    env = ChannelLastImages(Images(spaces.Box(0, 1, (1, 8, 8), np.uint8), mask))
+    np.testing.assert_array_equal(env.reset()[0][..., 0], 255 * mask[0])
+    whole = np.arange(192, dtype=np.int32).reshape(3, 8, 8)
+    env = ChannelLastImages(Images(spaces.Box(0, 255, (3, 8, 8), np.int32), whole))
+    np.testing.assert_array_equal(env.reset()[0], whole.transpose(1, 2, 0))
+    env = ChannelLastImages(Images(spaces.Box(0, 255, (3, 8, 8), np.int32), whole + 200))
+    with pytest.raises(ValueError, match=r"within 0..255 and holds .*200.* to .*391"):
         env.reset()
 
 

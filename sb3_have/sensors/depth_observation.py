@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, get_args
 
 import cv2
@@ -20,10 +21,13 @@ from sb3_have.sensors.rendering import (
     SensorWrapper,
     check_render_mode,
     describe,
+    is_number,
     parse_size,
     pick,
-    resize,
 )
+
+#: Share of the far plane from which on a MuJoCo scene with a skybox shows its wall; edges blur it below 0.7.
+SKY = 0.6
 
 DepthSource = Callable[[gym.Env[Any, Any]], Array]
 
@@ -33,11 +37,12 @@ class DepthObservation(SensorWrapper):
     Adds the image of a depth camera, uint8 (H, W, 1) as :func:`~sb3_have.sensors.encode_depth` has it: codes 1..255,
     and 0 for "nothing there".
 
-    :param env: Any environment.
+    :param env: Any environment. A process that has rendered MuJoCo must not be forked, see
+        :mod:`sb3_have.sensors.rendering`.
     :param source: ``"render"``, for render mode ``"depth_array"`` or ``"rgbd_tuple"`` (MuJoCo's depth buffer is
-        converted to metres with the near and far plane of its model, that of any other environment is taken for
-        metres); or a key of the observation, float metres (H, W) or (H, W, 1); or ``function(env)``, called after every
-        reset and step, which returns float metres (H, W). NaN, infinite and not positive mean "nothing there".
+        converted to metres by :func:`rendered_depth`, that of any other environment is taken for metres); or a key of
+        the observation, float metres (H, W) or (H, W, 1); or ``function(env)``, called after every reset and step,
+        which returns float metres (H, W). NaN, infinite and not positive mean "nothing there".
     :param encoding: ``"log"``, ``"clipped"`` or ``"inverse"``.
     :param maximum: Range in metres of ``"clipped"`` and ``"inverse"``, 100 by default.
     :param limits: Nearest and farthest distance in metres that the camera measures; beyond them there is nothing.
@@ -45,10 +50,12 @@ class DepthObservation(SensorWrapper):
         parameters. The noise is that of the rendered resolution, ``image_size`` comes after it.
     :param dropout: Probability that a pixel measures nothing, at every step anew.
     :param key: Key of the depth image; it may be ``source``, whose metres it then replaces.
-    :param image_size: Rows and columns, one number for both or a pair; None keeps the source's own. Every pixel takes
-        the nearest one: a mean over an edge would be a surface that is not there.
-    :raises ValueError: on a wrong render mode, an observation that is not such an image, an unknown option or a key
-        that exists already.
+    :param image_size: Rows and columns, one number for both or a pair. Every pixel takes the nearest one: a mean over
+        an edge would be a surface that is not there. None keeps the source's own; unless it is a key or MuJoCo's
+        rendering, that takes a first image: the environment is reset when it is wrapped, which ends an episode under
+        way and takes a draw from its generator. With a function over MuJoCo a size must be given.
+    :raises ValueError: on a wrong render mode, an observation that is not such an image, an unknown option, a key
+        that exists already, or a source whose size changes.
     :raises KeyError: if the observation has no key ``source``.
     """
 
@@ -64,7 +71,8 @@ class DepthObservation(SensorWrapper):
         key: str = "depth",
         image_size: int | tuple[int, int] | None = None,
     ) -> None:
-        # No copies: a function may be a method of the environment.
+        noise = dict(noise) if isinstance(noise, Mapping) else noise
+        # No deep copies: a function may be a method of the environment.
         gym.utils.RecordConstructorArgs.__init__(
             self,
             _disable_deepcopy=True,
@@ -83,11 +91,16 @@ class DepthObservation(SensorWrapper):
                 f"maximum={maximum!r} has no effect with encoding 'log', whose range is fixed; leave it out or choose "
                 f"another of {get_args(DepthEncoding)}"
             )
-        if len(limits) != 2 or not 0 <= limits[0] < limits[1]:
-            raise ValueError(f"limits must be (nearest, farthest) in metres with 0 <= nearest < farthest, got {limits}")
-        if not 0 <= dropout <= 1:
+        pair = isinstance(limits, Sequence) and len(limits) == 2 and all(map(is_number, limits))
+        if not pair or not 0 <= limits[0] < limits[1]:
+            raise ValueError(
+                f"limits must be (nearest, farthest) in metres with 0 <= nearest < farthest, got {limits!r}"
+            )
+        if not is_number(dropout) or not 0 <= dropout <= 1:
             raise ValueError(f"dropout must be a probability 0..1, got {dropout!r}")
         self.source, self.encoding, self.limits, self.dropout = source, encoding, limits, dropout
+        if maximum is not None and not is_number(maximum):
+            raise ValueError(f"maximum must be a number of metres, got {maximum!r}")
         self.maximum = 100.0 if maximum is None else float(maximum)
         self.noise = _noise_options(noise)
         # Complain about a wrong value now, not at the first step.
@@ -102,7 +115,8 @@ class DepthObservation(SensorWrapper):
         metres = self._metres(observation)
         if self.noise is not None:
             metres = disparity_noise(metres, self._rng, **self.noise)
-        metres = resize(metres, self.image_size, cv2.INTER_NEAREST)
+        # INTER_NEAREST would take the first pixel of an area instead of the middle one.
+        metres = self.fit(metres, self.image_size, cv2.INTER_NEAREST_EXACT)
         gone = (metres < self.limits[0]) | (metres > self.limits[1])
         if self.dropout:
             gone |= self._rng.random(metres.shape) < self.dropout
@@ -122,53 +136,67 @@ class DepthObservation(SensorWrapper):
         if self.source == "render":
             check_render_mode(self.env, DEPTH_MODES, self.class_name())
             return size or self._rendered_size(DEPTH_MODES)
+        if callable(self.source):
+            return size or self._first_size(lambda: self._metres({}))
         if not isinstance(self.source, str):
-            if size is None:
-                self.env.reset()
-                size = self._metres({}).shape[:2]
-            return size
+            raise ValueError(f"DepthObservation: source must be 'render', a key or function(env), got {self.source!r}")
         space = pick(self.inner_spaces, self.source, self.class_name())
         if not isinstance(space, spaces.Box) or not _is_depth(space.shape, space.dtype):
             raise ValueError(
                 f"DepthObservation: {self.source!r} must be float metres (H, W) or (H, W, 1), got {space}; convert "
-                "other units with source=function(env)"
+                "other units and shapes before with gymnasium.wrappers.TransformObservation"
             )
+        self._source_size = space.shape[:2]
         return size or (space.shape[0], space.shape[1])
 
 
 def rendered_depth(env: gym.Env[Any, Any], depth: Array) -> Array:
     """
-    Metres of a depth rendering.
+    Metres along the optical axis of a depth rendering, infinite where there is nothing. MuJoCo draws a skybox as a wall
+    around the camera at 0.7 of the far plane: with one, nothing is there from 0.6 of the far plane on (120 m in
+    Hopper-v5, 240 m in HalfCheetah-v5), measured along the line of sight.
 
     :param env: Environment that rendered it, wrapped or not.
-    :param depth: (H, W), MuJoCo's depth buffer or metres.
+    :param depth: (H, W), MuJoCo's depth buffer, or metres from any other environment.
     """
-    base: Any = env.unwrapped
-    model: Any = getattr(base, "model", None)
-    if not hasattr(base, "mujoco_renderer") or not hasattr(getattr(model, "vis", None), "map"):
+    renderer: Any = getattr(env.unwrapped, "mujoco_renderer", None)
+    if renderer is None:
         return depth
-    renderer = base.mujoco_renderer
-    free = renderer.camera_id is None or renderer.camera_id < 0
-    if free:
-        orthographic = renderer.viewer.cam.orthographic
-    else:
-        orthographic = hasattr(model, "cam_projection") and model.cam_projection[renderer.camera_id]
-    # MuJoCo gives both planes in units of the size of the model.
-    near, far = (float(plane * model.stat.extent) for plane in (model.vis.map.znear, model.vis.map.zfar))
-    return depth_from_zbuffer(depth, near, far, bool(orthographic))
+    mujoco: Any = importlib.import_module("mujoco")  # an extra
+
+    scene = renderer.viewer.scn
+    eye = scene.camera[0]
+    near, far, parallel = float(eye.frustum_near), float(eye.frustum_far), bool(eye.orthographic)
+    metres = depth_from_zbuffer(depth, near, far, parallel)
+    skybox = (renderer.model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).any()
+    if not skybox or not scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX]:
+        return metres
+    # The frustum is given where it meets the near plane, upwards and to the right.
+    height, width = depth.shape
+    half = eye.frustum_width or (eye.frustum_top - eye.frustum_bottom) / 2 * width / height
+    up = _pixel_centres(eye.frustum_top, eye.frustum_bottom, height)[:, None]
+    right = _pixel_centres(eye.frustum_center - half, eye.frustum_center + half, width)
+    aside = np.hypot(up, right) * (1 if parallel else metres / near)
+    return np.where(np.hypot(metres, aside) < SKY * far, metres, np.inf)
+
+
+def _pixel_centres(first: float, last: float, number: int) -> NDArray[np.float64]:
+    return first + (last - first) * (np.arange(number) + 0.5) / number
 
 
 def _noise_options(noise: Mapping[str, float] | str | None) -> dict[str, float] | None:
     if noise is None:
         return None
-    if isinstance(noise, str):
-        if noise != "redwood":
-            raise ValueError(f"noise must be None, 'redwood' or a dict of its parameters, got {noise!r}")
+    if noise == "redwood":
         return {}
+    if not isinstance(noise, Mapping):
+        raise ValueError(f"noise must be None, 'redwood' or a dict of its parameters, got {noise!r}")
     known = [name for name in inspect.signature(disparity_noise).parameters if name not in ("depth", "rng")]
     unknown = set(noise) - set(known)
     if unknown:
         raise ValueError(f"unknown noise option {sorted(unknown)}; the options are {', '.join(known)}")
+    if not all(map(is_number, noise.values())):
+        raise ValueError(f"the noise options are numbers, got {dict(noise)}")
     return dict(noise)
 
 

@@ -1,12 +1,18 @@
-"""What an environment renders, as a sensor of its agent. Any number of sensors share one rendering a step."""
+"""What an environment renders, as a sensor of its agent. Any number of sensors share one rendering a step.
+
+MuJoCo: a process that has rendered with it must not be forked, its children hang in their first rendering. Making an
+environment with these wrappers does not render MuJoCo. After a rendering in the parent, start the workers with
+``AsyncVectorEnv(..., context="spawn")`` or ``SubprocVecEnv(..., start_method="forkserver")``, its default.
+"""
 
 from __future__ import annotations
 
+import copy
 import zlib
-from collections.abc import Mapping, Sequence
-from numbers import Integral
+from collections.abc import Callable, Mapping, Sequence
+from numbers import Integral, Real
 from types import TracebackType
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 import cv2
 import gymnasium as gym
@@ -36,13 +42,13 @@ class SensorWrapper(gym.Wrapper[Observation, Any, Any, Any], gym.utils.RecordCon
     Base of the wrappers that add one modality. A Dict observation gets one more key; any other observation becomes a
     Dict with the keys ``"state"`` and ``key``.
 
-    The environment is rendered once a step, however many wrappers look: ``render()`` of this wrapper returns the
-    rendering that the observation was made from until the next step or reset.
+    The environment is rendered once a step, however many wrappers look: ``render()`` of this wrapper returns a copy of
+    the rendering that the observation was made from until the next step or reset.
 
     :param env: Environment to wrap.
     :param key: Key of the modality.
     :param replaces: A key that the modality may take the place of.
-    :raises ValueError: if the key exists already.
+    :raises ValueError: if the key exists already or is no string.
     """
 
     def __init__(self, env: gym.Env[Any, Any], key: str, replaces: str | None = None) -> None:
@@ -52,6 +58,8 @@ class SensorWrapper(gym.Wrapper[Observation, Any, Any, Any], gym.utils.RecordCon
         self.inner_spaces: dict[str, spaces.Space[Any]] = (
             dict(space.spaces) if isinstance(space, spaces.Dict) else {STATE: space}
         )
+        if not isinstance(key, str):
+            raise ValueError(f"{self.class_name()}: key must be a string, got {key!r}")
         if key in self.inner_spaces and key != replaces:
             raise ValueError(
                 f"{self.class_name()}: the observation has a key {key!r} already, among {list(self.inner_spaces)}; "
@@ -61,6 +69,8 @@ class SensorWrapper(gym.Wrapper[Observation, Any, Any, Any], gym.utils.RecordCon
         # Its own generator: an environment behaves the same with and without the sensor.
         self._rng = np.random.default_rng()
         self._rendered: Any = None
+        # Rows and columns of the source, None until they are known.
+        self._source_size: tuple[int, ...] | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -80,7 +90,7 @@ class SensorWrapper(gym.Wrapper[Observation, Any, Any, Any], gym.utils.RecordCon
 
     def render(self) -> Any:
         """As the environment, without rendering the same instant a second time."""
-        return self.env.render() if self._rendered is None else self._rendered
+        return self.env.render() if self._rendered is None else copy.deepcopy(self._rendered)
 
     def sense(self, observation: Observation, start: bool) -> Array:
         """
@@ -94,7 +104,28 @@ class SensorWrapper(gym.Wrapper[Observation, Any, Any, Any], gym.utils.RecordCon
     def look(self) -> Frames:
         """The frames that the environment renders now, sorted and checked."""
         self._rendered = self.env.render()
+        viewer = getattr(self.env.unwrapped, "viewer", None)
+        if is_highway_env(self.env) and getattr(viewer, "enabled", None) is False:
+            raise ValueError(
+                f"{self.class_name()}: with SDL_VIDEODRIVER=dummy highway-env draws nothing and every frame is black; "
+                "unset it, or set it to 'offscreen', before the environment is made"
+            )
         return sort_frames(self.env.render_mode, self._rendered)
+
+    def fit(self, image: Array, size: tuple[int, int], interpolation: int = cv2.INTER_AREA) -> Array:
+        """
+        An image of the source in the size of the sensor.
+
+        :raises ValueError: if the source has another size than before.
+        """
+        shape = image.shape[:2]
+        if self._source_size not in (None, shape):
+            raise ValueError(
+                f"{self.class_name()}: the source of {self.key!r} had {self._source_size} rows and columns, and now "
+                f"has {shape}; its size may not change, so resize its images before this wrapper"
+            )
+        self._source_size = shape
+        return resize(image, size, interpolation)
 
     def _extend(self, observation: Any, start: bool) -> Observation:
         inner = dict(observation) if isinstance(self.env.observation_space, spaces.Dict) else {STATE: observation}
@@ -111,16 +142,27 @@ class SensorWrapper(gym.Wrapper[Observation, Any, Any, Any], gym.utils.RecordCon
 
     def _rendered_size(self, modes: Sequence[str]) -> tuple[int, int]:
         """Rows and columns of the rendering; where they cannot be known, from a first one."""
-        check_render_mode(self.env, modes, self.class_name())
-        # MuJoCo: a process that has rendered cannot be forked (its children hang), and AsyncVectorEnv makes one
-        # environment in the parent.
         renderer = getattr(self.env.unwrapped, "mujoco_renderer", None)
         if renderer is not None:
             return int(renderer.height), int(renderer.width)
+
+        def see() -> Array:
+            frames = self.look()
+            return (frames.colour or frames.depth)[-1]
+
+        return self._first_size(see)
+
+    def _first_size(self, see: Callable[[], Array]) -> tuple[int, int]:
+        """Rows and columns of a first image, for which the environment is reset."""
+        if hasattr(self.env.unwrapped, "mujoco_renderer"):
+            # AsyncVectorEnv makes one environment in the parent and then forks.
+            raise ValueError(
+                f"{self.class_name()} of a MuJoCo environment needs image_size= with a function as source: to find the "
+                "size it would have to render, and a process that has rendered MuJoCo cannot be forked"
+            )
         self.env.reset()
-        frames = self.look()
+        height, width = self._source_size = see().shape[:2]
         self._rendered = None
-        height, width = (frames.colour or frames.depth)[-1].shape[:2]
         return height, width
 
 
@@ -129,11 +171,13 @@ class RenderObservation(SensorWrapper):
     Adds what the environment renders to the observation, as a colour image.
 
     :param env: Any environment made with ``render_mode="rgb_array"`` or, for depth from the same rendering,
-        ``"rgbd_tuple"``.
+        ``"rgbd_tuple"``. A process that has rendered MuJoCo must not be forked, see the top of this module.
     :param key: Key of the image.
-    :param image_size: Rows and columns, one number for both or a pair; None keeps the rendering's own. Each pixel is
-        the mean of the area it covers.
-    :raises ValueError: on another render mode, a key that exists already, or an impossible size.
+    :param image_size: Rows and columns, one number for both or a pair. Each pixel is the mean of the area it covers.
+        None keeps the rendering's own, which takes a first rendering (MuJoCo says it without): the environment is
+        reset when it is wrapped, which ends an episode under way and takes a draw from its generator.
+    :raises ValueError: on another render mode, a key that exists already, an impossible size, or a rendering whose
+        size changes.
     """
 
     def __init__(
@@ -147,8 +191,8 @@ class RenderObservation(SensorWrapper):
 
     def sense(self, observation: Observation, start: bool) -> NDArray[np.uint8]:
         """The latest frame, uint8 (H, W, 3)."""
-        # A copy: the rendering is handed out by render() too.
-        return np.array(resize(self.look().colour[-1], self.image_size), order="C")
+        # A copy: other sensors look at the rendering too.
+        return np.array(self.fit(self.look().colour[-1], self.image_size), order="C")
 
 
 class IntermediateFrames:
@@ -193,7 +237,7 @@ def step_duration(env: gym.Env[Any, Any]) -> float | None:
     if is_highway_env(env):
         return 1 / float(env.unwrapped.config["policy_frequency"])  # type: ignore[attr-defined]
     dt, rate = getattr(env.unwrapped, "dt", None), env.metadata.get("render_fps")
-    if isinstance(dt, (int, float)) and 0 < dt < np.inf:
+    if is_number(dt) and 0 < dt < np.inf:
         return float(dt)
     return 1 / float(rate) if rate else None
 
@@ -247,6 +291,11 @@ def describe(value: Any) -> str:
     return f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
 
 
+def is_number(value: Any, kind: type = Real) -> TypeGuard[float]:
+    """Whether this is one number of Python or numpy, a whole one with ``kind=Integral``; a bool is not."""
+    return isinstance(value, kind) and not isinstance(value, bool)
+
+
 def parse_size(image_size: int | Sequence[int] | None) -> tuple[int, int] | None:
     """
     (rows, columns) of one number or a pair.
@@ -256,7 +305,7 @@ def parse_size(image_size: int | Sequence[int] | None) -> tuple[int, int] | None
     if image_size is None:
         return None
     size = tuple(image_size) if isinstance(image_size, Sequence) else (image_size, image_size)
-    if len(size) != 2 or not all(isinstance(side, Integral) and int(side) > 0 for side in size):
+    if len(size) != 2 or not all(is_number(side, Integral) and int(side) > 0 for side in size):
         raise ValueError(f"image_size must be a whole number or a pair (rows, columns), got {image_size!r}")
     return int(size[0]), int(size[1])
 
@@ -273,5 +322,5 @@ def pick(available: Mapping[str, Any], key: str, wrapper: str) -> Any:
     :raises KeyError: if there is no such key; lists those there are.
     """
     if key not in available:
-        raise KeyError(f"{wrapper}: the observation has no key {key!r}, only {list(available)}")
+        raise KeyError(f"{wrapper}: the observation has no key {key!r}, only {list(available)}; name one of them")
     return available[key]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection
 from typing import Any
 
 import gymnasium as gym
@@ -25,6 +25,8 @@ class DictObservation(gym.ObservationWrapper[Observation, Any, Any], gym.utils.R
     def __init__(self, env: gym.Env[Any, Any], key: str = STATE) -> None:
         gym.utils.RecordConstructorArgs.__init__(self, key=key)
         gym.ObservationWrapper.__init__(self, env)
+        if not isinstance(key, str):
+            raise ValueError(f"DictObservation: key must be a string, got {key!r}")
         if isinstance(env.observation_space, spaces.Dict):
             raise ValueError(
                 f"DictObservation: the observation is a Dict already, with keys {list(env.observation_space.spaces)}"
@@ -47,15 +49,13 @@ class SelectModalities(gym.ObservationWrapper[Observation, Any, Observation], gy
     :raises KeyError: if a key is missing.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], keys: Sequence[str]) -> None:
+    def __init__(self, env: gym.Env[Any, Any], keys: Collection[str]) -> None:
         gym.utils.RecordConstructorArgs.__init__(self, keys=keys)
         gym.ObservationWrapper.__init__(self, env)
         space = env.observation_space
         if not isinstance(space, spaces.Dict):
             raise ValueError(f"SelectModalities needs a Dict observation, got {space}; use DictObservation first")
-        if isinstance(keys, str) or not keys:
-            raise ValueError(f"SelectModalities: keys must be a non-empty list of keys, got {keys!r}")
-        self.keys = tuple(keys)
+        self.keys = _key_list(keys, "SelectModalities")
         self.observation_space = spaces.Dict(
             {key: pick(space.spaces, key, "SelectModalities") for key in self.keys}, sort_keys=space.sort_keys
         )
@@ -67,35 +67,33 @@ class SelectModalities(gym.ObservationWrapper[Observation, Any, Observation], gy
 
 class ChannelLastImages(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordConstructorArgs):
     """
-    Images as uint8 (H, W, C), whatever their form: channels first become last, (H, W) becomes (H, W, 1), and floats
-    in 0..1 or 0..255 are rounded to 0..255.
+    Images as uint8 (H, W, C), whatever their form: channels first become last, (H, W) becomes (H, W, 1), and numbers
+    in 0..1 or 0..255, floats or whole ones, are scaled and rounded to 0..255.
 
     The channels are the smallest of the three sizes; between equal ones, the last.
 
     :param env: Environment with a Dict observation, or with one image.
-    :param keys: Keys of the images. None takes every Box of three sizes that is uint8, or float with bounds 0..1 or
-        0..255; grey (H, W) images must be named.
-    :raises ValueError: if a named key is no image, if there is none, or on a float image out of its bounds.
+    :param keys: Keys of the images. None takes every Box of three sizes with bounds 0..1 or 0..255; grey (H, W) images
+        must be named.
+    :raises ValueError: if a named key is no image, if there is none, or on an image that is not of its space: its
+        shape, its kind of number, or its bounds.
     :raises KeyError: if a key is missing.
     """
 
-    def __init__(self, env: gym.Env[Any, Any], keys: Sequence[str] | None = None) -> None:
+    def __init__(self, env: gym.Env[Any, Any], keys: Collection[str] | None = None) -> None:
         gym.utils.RecordConstructorArgs.__init__(self, keys=keys)
         gym.ObservationWrapper.__init__(self, env)
         space = env.observation_space
-        if isinstance(keys, str) or (keys is not None and not keys):
-            raise ValueError(f"ChannelLastImages: keys must be a non-empty list of keys, got {keys!r}")
         self._is_dict = isinstance(space, spaces.Dict)
         inner: dict[str, spaces.Space[Any]] = dict(space.spaces) if isinstance(space, spaces.Dict) else {STATE: space}
-        if keys is None:
-            keys = [key for key, part in inner.items() if _image_fault(part) is None and len(part.shape or ()) == 3]
+        if keys is not None:
+            keys = _key_list(keys, "ChannelLastImages")
+        else:
+            keys = [key for key, part in inner.items() if image_fault(part) is None and len(part.shape or ()) == 3]
             if not keys:
-                raise ValueError(
-                    "ChannelLastImages: no image of three sizes, uint8 or float with bounds 0..1 or 0..255, among "
-                    f"{inner}"
-                )
+                raise ValueError(f"ChannelLastImages: no image of three sizes with bounds 0..1 or 0..255 among {inner}")
         for key in keys:
-            fault = _image_fault(pick(inner, key, "ChannelLastImages"))
+            fault = image_fault(pick(inner, key, "ChannelLastImages"))
             if fault is not None:
                 raise ValueError(f"ChannelLastImages: {key!r} is not an image: {fault}, got {inner[key]}")
         self.keys = tuple(keys)
@@ -117,31 +115,37 @@ class ChannelLastImages(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordC
 
     def _convert(self, key: str, image: Array) -> NDArray[np.uint8]:
         space = self.sources[key]
-        if np.shape(image) != space.shape:
-            raise ValueError(f"ChannelLastImages: {key!r} should have shape {space.shape}, got {describe(image)}")
-        if space.dtype != np.uint8:
-            high = float(space.high.max())
+        same = isinstance(image, np.ndarray) and image.shape == space.shape
+        if not same or not np.can_cast(image.dtype, space.dtype, "same_kind"):
+            raise ValueError(
+                f"ChannelLastImages: {key!r} should be {space.dtype} {space.shape}, as its space says, got "
+                f"{describe(image)}"
+            )
+        high = float(space.high.max())
+        if image.dtype != np.uint8 or high != 255:
             # Written so that NaN fails too.
             if not (image.min() >= 0 and image.max() <= high):
                 raise ValueError(
                     f"ChannelLastImages: {key!r} is declared within 0..{high:g} and holds {image.min()!r} to "
-                    f"{image.max()!r}; clip it, or declare its range: a float image has bounds 0..1 or 0..255"
+                    f"{image.max()!r}; clip it, or declare its range: an image has bounds 0..1 or 0..255"
                 )
             image = np.rint(image * (255 / high))
         return np.array(_channels_last(image), dtype=np.uint8, order="C")
 
 
-def _image_fault(space: Any) -> str | None:
+def _key_list(keys: Any, wrapper: str) -> tuple[str, ...]:
+    if isinstance(keys, str) or not isinstance(keys, Collection) or not keys:
+        raise ValueError(f"{wrapper}: keys must be a non-empty list of keys, got {keys!r}")
+    return tuple(keys)
+
+
+def image_fault(space: Any) -> str | None:
     """What keeps a space from being an image; None if nothing does."""
     if not isinstance(space, spaces.Box) or len(space.shape) not in (2, 3):
         return "an image is a Box of shape (H, W), (H, W, C) or (C, H, W)"
-    if space.dtype != np.uint8 and not (
-        np.dtype(space.dtype).kind == "f"
-        and (space.low == 0).all()
-        and len(np.unique(space.high)) == 1
-        and space.high.flat[0] in (1, 255)
-    ):
-        return "it must be uint8, or float with bounds 0..1 or 0..255"
+    highest = np.unique(space.high)
+    if np.dtype(space.dtype).kind not in "uif" or (space.low != 0).any() or highest.tolist() not in ([1], [255]):
+        return "its bounds must be 0..1 or 0..255"
     if len(space.shape) == 3 and int(np.argmin(space.shape[::-1])) == 1:
         return "its channels would be the second size"
     return None
