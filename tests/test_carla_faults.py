@@ -187,6 +187,14 @@ def test_an_error_of_another_kind_is_no_sign_of_death(server: Server, env: Carla
     works(server, env)
 
 
+def test_an_error_right_after_an_interrupted_spawn(server: Server, env: CarlaVisionEnv) -> None:
+    server.fail("World.try_spawn_actor", KeyboardInterrupt(), after=1, done=True)
+    server.fail("World.tick", RuntimeError("rpc::rpc_error during call"))  # whose success would list the actor
+    with pytest.raises(KeyboardInterrupt):
+        env.reset()
+    works(server, env)
+
+
 def test_two_ctrl_c_one_of_them_right_after_a_spawn(monkeypatch: pytest.MonkeyPatch) -> None:
     for second, before in (("World.tick", 0), ("World.get_actors", 1), ("Client.apply_batch_sync", 0)):
         server = fresh(monkeypatch)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from typing import Any, Final, cast
 
 import carla
@@ -200,12 +199,15 @@ class Session:
 
     def _destroy(self, role: str | None = None) -> None:
         """Remove all actors whose role begins so; the server knows them, even if an interrupt hid them from us."""
-        if self._unlisted:
-            # New actors are listed from the next tick on; a server too slow for one may still remove the others.
-            with suppress(RuntimeError, CarlaConnectionError):
-                self.tick()
+        try:
+            if self._unlisted and not _lost_with_traffic:
+                self.tick()  # new actors are listed from the next tick on
+        finally:  # a server too slow for a tick may still remove what it lists
+            self._remove_listed(self.role if role is None else role)
+
+    def _remove_listed(self, role: str) -> None:
         everybody = cast(Iterable[carla.Actor], self.world.get_actors())
-        ours = [actor for actor in everybody if actor.attributes.get("role_name", "").startswith(role or self.role)]
+        ours = [actor for actor in everybody if actor.attributes.get("role_name", "").startswith(role)]
         ours.sort(key=lambda actor: not actor.type_id.startswith("sensor."))  # these first
         if ours:
             destroy = [carla.command.DestroyActor(actor.id) for actor in ours]
