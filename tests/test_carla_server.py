@@ -195,6 +195,15 @@ def test_a_slow_server_is_not_a_lost_one(server: Server, env: CarlaVisionEnv) ->
     works(server, env)
 
 
+def test_a_server_that_ticks_too_late_is_cleared_all_the_same(server: Server, env: CarlaVisionEnv) -> None:
+    for tick in range(3):  # the first of the episode, and two to list its actors
+        server.fail("World.tick", RuntimeError("time-out of 100ms while waiting"), after=tick, done=True)
+    with pytest.warns(UserWarning, match="cleaning up .* time-out"), pytest.raises(TimeoutError, match="alive"):
+        env.reset()
+    assert server.left_behind() == []
+    works(server, env)
+
+
 def test_two_servers_at_a_time(monkeypatch: pytest.MonkeyPatch, server: Server, env: CarlaVisionEnv) -> None:
     other = Server("Town01", port=2100)
     install(monkeypatch, server, other)
