@@ -1,6 +1,7 @@
 """What sensors look at: the scale of its numbers, its size, its time, and who else may touch it."""
 
 import warnings
+from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
@@ -71,10 +72,12 @@ def test_keys_that_are_no_frames(space: spaces.Box, remedy: str) -> None:
 
 
 class Growing(MovingBar):
-    """Its picture, its metres and its camera are wider from the second step on."""
+    """Its picture, its metres and its camera are wider from the second step on, or from another."""
+
+    grows_at = 2
 
     def _wider(self, value: Any) -> Any:
-        return np.repeat(value, 2, axis=1) if self.steps > 1 else value
+        return np.repeat(value, 2, axis=1) if self.steps >= self.grows_at else value
 
     def observe(self) -> Any:
         seen = super().observe()
@@ -85,8 +88,7 @@ class Growing(MovingBar):
         return self._wider(frame), self._wider(depth)
 
 
-@pytest.mark.parametrize("image_size", [None, 16])
-@pytest.mark.parametrize(
+every_source = pytest.mark.parametrize(
     "wrapper, source",
     [
         (RenderObservation, {}),
@@ -98,12 +100,24 @@ class Growing(MovingBar):
         (DepthObservation, {"source": lambda env: env.unwrapped.render()[1]}),
     ],
 )
+
+
+@every_source
+@pytest.mark.parametrize("image_size", [None, 16])
 def test_a_source_that_changes_its_size(wrapper: Any, source: dict[str, Any], image_size: int | None) -> None:
     env = wrapper(Growing("rgbd_tuple", "dict"), image_size=image_size, **source)
     env.reset(seed=0)
     env.step(np.zeros(2))
     with pytest.raises(ValueError, match=r"had \(36, 40\) rows and columns, and now has \(36, 80\)"):
         env.step(np.zeros(2))
+
+
+@every_source
+def test_a_source_that_has_another_size_than_it_said(wrapper: Any, source: dict[str, Any]) -> None:
+    env = wrapper(Growing("rgbd_tuple", "dict"), **source)
+    env.unwrapped.grows_at = 0
+    with pytest.raises(ValueError, match=r"had \(36, 40\) rows and columns, and now has \(36, 80\)"):
+        env.reset(seed=0)
 
 
 @pytest.mark.parametrize("wrapper", [RenderObservation, EventObservation])
@@ -118,6 +132,9 @@ def test_highway_env_that_is_told_to_draw_nothing(
     vision = gym.make("HighwayVision-v0", render_mode="rgb_array", vehicles_count=2)
     assert wrapper(vision, image_size=image_size, key="view").reset(seed=0)[0]["view"].any()
     vision.close()
+    other: Any = MovingBar("rgb_array")
+    other.viewer = SimpleNamespace(enabled=False)
+    assert wrapper(other, image_size=image_size, key="view").reset()[0]["view"].any()
 
 
 @pytest.mark.parametrize("dt", [0.5, np.float32(0.5), np.float64(0.5)], ids=repr)
@@ -128,14 +145,14 @@ def test_step_durations_of_any_number(dt: Any) -> None:
     assert step_duration(env) == 0.5
 
 
-def test_time_stands_still_when_a_frame_is_refused() -> None:
+@pytest.mark.parametrize("broken, time", [(3, 0.1), (4, 0.15)])
+def test_time_stands_still_when_a_frame_is_refused(broken: int, time: float) -> None:
     """The camera refuses it, and the next step begins where the last accepted frame was."""
     frames = [np.full((4, 4), value) for value in (10.0, 20.0, 40.0, 80.0, 160.0)]
-    broken = {3}
 
     def film(env: Any) -> list[Any]:
         step = 2 * env.unwrapped.steps
-        return [np.full((4, 4), np.nan) if k in broken else frames[k] for k in (step - 1, step)]
+        return [np.full((4, 4), np.nan) if k == broken else frames[k] for k in (step - 1, step)]
 
     env = EventObservation(MovingBar(), film, image_size=4, bins=2)
     env.reset(seed=0)
@@ -143,7 +160,7 @@ def test_time_stands_still_when_a_frame_is_refused() -> None:
     assert env.time == env.camera._time == pytest.approx(0.1)
     with pytest.raises(ValueError, match="NaN"):
         env.step(np.zeros(2))
-    assert env.time == env.camera._time == pytest.approx(0.1)
+    assert env.time == env.camera._time == pytest.approx(time)
 
 
 def test_a_rendering_in_several_parts_is_handed_out_as_a_copy() -> None:
