@@ -46,19 +46,13 @@ def load_config(name: str, env_id: str) -> dict[str, Any]:
 
 
 def evaluation_env_kwargs(config: Mapping[str, Any]) -> dict[str, Any]:
-    """
-    Keywords of the environments that a configuration is evaluated in.
-
-    These are ``env_kwargs``, overridden by ``eval_env_kwargs`` (``--eval-env-kwargs`` in the Zoo), without the weather,
-    which :func:`sb3_have.evaluate` sets itself.
-    """
-    merged = {**config.get("env_kwargs", {}), **config.get("eval_env_kwargs", {})}
-    return {key: value for key, value in merged.items() if key != "weather"}
+    """The ``env_kwargs`` of a configuration without the weather, which :func:`sb3_have.evaluate` sets itself."""
+    return {key: value for key, value in config.get("env_kwargs", {}).items() if key != "weather"}
 
 
 def model_kwargs(config: Mapping[str, Any]) -> dict[str, Any]:
     """What of a configuration goes to the algorithm's constructor."""
-    for_others = {"n_timesteps", "n_envs", "frame_stack", "env_kwargs", "eval_env_kwargs", "env_wrapper"}
+    for_others = {"n_timesteps", "n_envs", "frame_stack", "env_kwargs", "env_wrapper"}
     # copied, because SB3 writes into policy_kwargs
     return {key: deepcopy(value) for key, value in config.items() if key not in for_others}
 

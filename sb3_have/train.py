@@ -138,6 +138,7 @@ class Run:
     :param eval_freq: steps from one evaluation to the next, 0 for none
     :param eval_episodes: episodes in each weather of an evaluation
     :param eval_envs: processes that evaluate
+    :param eval_env_kwargs: for the evaluation's environments, in place of the configuration's ``env_kwargs``
     :param weathers: to evaluate in
     :param save_freq: steps from one checkpoint to the next, 0 for one at the end only
     :param time_limit: of the training in this call [s], None for none
@@ -154,6 +155,7 @@ class Run:
         eval_freq: int = 10_000,
         eval_episodes: int = 2,
         eval_envs: int = 1,
+        eval_env_kwargs: Mapping[str, Any] | None = None,
         weathers: Sequence[str] = WEATHERS,
         save_freq: int = 5_000,
         time_limit: float | None = None,
@@ -161,6 +163,7 @@ class Run:
     ) -> None:
         self.config, self.env_id, self.out, self.seed, self.algo = dict(config), env_id, Path(out), seed, algo
         self.eval_freq, self.eval_episodes, self.eval_envs = eval_freq, eval_episodes, eval_envs
+        self.eval_env_kwargs = {**evaluation_env_kwargs(config), **(eval_env_kwargs or {})}
         self.weathers, self.save_freq, self.time_limit = weathers, save_freq, time_limit
         self.device = device
         self.seconds = 0.0  # spent training and evaluating, over all sessions
@@ -275,7 +278,7 @@ class Run:
             self.weathers,
             self.eval_episodes,
             EVALUATION_SEED,
-            evaluation_env_kwargs(self.config),
+            self.eval_env_kwargs,
             n_envs=self.eval_envs,
             env_wrapper=env_wrapper(self.config),
         )
@@ -327,6 +330,14 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--eval-freq", type=int, default=10_000, help="steps between evaluations, 0 for none")
     parser.add_argument("--eval-episodes", type=int, default=2, help="in each weather")
     parser.add_argument("--eval-envs", type=int, default=1, help="processes that evaluate")
+    parser.add_argument(
+        "--eval-env-kwargs",
+        nargs="+",
+        default=[],
+        type=hyperparameter,
+        metavar="NAME:VALUE",
+        help="for the evaluation's environments, in place of the configuration's env_kwargs",
+    )
     parser.add_argument("--save-freq", type=int, default=5_000, help="steps between checkpoints")
     parser.add_argument("--time-limit", type=float, help="seconds of training in this session")
     parser.add_argument("--device", default="auto")
@@ -343,6 +354,7 @@ def main(arguments: list[str] | None = None) -> None:
         eval_freq=args.eval_freq,
         eval_episodes=args.eval_episodes,
         eval_envs=args.eval_envs,
+        eval_env_kwargs=dict(args.eval_env_kwargs),
         save_freq=args.save_freq,
         time_limit=args.time_limit,
         device=args.device,

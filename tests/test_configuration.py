@@ -7,6 +7,7 @@ from typing import Any
 
 import gymnasium as gym
 import pytest
+import yaml
 from fake_drive import ENV_ID
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 
@@ -16,7 +17,6 @@ from sb3_have.common.evaluation import evaluate_episodes
 from sb3_have.configuration import (
     config_path,
     env_wrapper,
-    evaluation_env_kwargs,
     hyperparameter,
     load_config,
     model_kwargs,
@@ -48,21 +48,31 @@ def test_unknown_configuration_is_explained(tmp_path: Path) -> None:
 
 def test_one_block_for_both_simulators() -> None:
     ours, theirs = load_config("havesac", "CarlaVision-v0"), load_config("havesac", "HighwayVision-v0")
-    servers = ours.pop("eval_env_kwargs")
     assert ours == {**theirs, "env_kwargs": {**theirs["env_kwargs"], "reward": "highway"}}
-    assert servers == {"port": 2010, "tm_port": 8010}
 
 
-def test_evaluation_has_keywords_of_its_own() -> None:
-    config: dict[str, Any] = {"env_kwargs": {"weather": "fast", "port": 1, "size": 2}, "eval_env_kwargs": {"port": 3}}
-    assert evaluation_env_kwargs(config) == {"port": 3, "size": 2}
-    assert evaluation_env_kwargs({"eval_env_kwargs": {"weather": "fast", "port": 3}}) == {"port": 3}
-    assert evaluation_env_kwargs({}) == {}
-    assert config["env_kwargs"]["port"] == 1
+def test_evaluation_has_keywords_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As in CARLA, where each environment needs a server of its own."""
+    evaluated: list[dict[str, Any]] = []
+
+    class Enough(Exception):
+        pass
+
+    def record(*args: Any, **kwargs: Any) -> None:
+        evaluated.append(args[5])
+        raise Enough
+
+    monkeypatch.setattr(train, "evaluate", record)
+    (tmp_path / "mine.yml").write_text(yaml.safe_dump({ENV_ID: {**CONFIG, "env_kwargs": {"weather": "fast"}}}))
+    run = ["--config", str(tmp_path / "mine.yml"), "--env", ENV_ID, "--algo", "sac", "--steps", "1", "--eval-freq", "1"]
+    for number, more in enumerate(([], ["--eval-env-kwargs", "image_size:40", "port:2010"])):
+        with pytest.raises(Enough):
+            train.main([*run, "--out", str(tmp_path / str(number)), *more])
+    assert evaluated == [{}, {"image_size": 40, "port": 2010}]
 
 
 def test_constructor_gets_a_copy_of_what_concerns_it() -> None:
-    kwargs = model_kwargs({**CONFIG, "n_envs": 2, "env_wrapper": SHORT, "eval_env_kwargs": {"weather": "slow"}})
+    kwargs = model_kwargs({**CONFIG, "n_envs": 2, "env_wrapper": SHORT})
     assert set(CONFIG) - set(kwargs) == {"n_timesteps", "frame_stack", "env_kwargs"}
     assert set(kwargs) < set(CONFIG)
     kwargs["policy_kwargs"]["net_arch"].append(1)
