@@ -72,7 +72,7 @@ def make_env(contender: Contender, control_frequency: int, vehicles: int) -> gym
     if contender.image_size is None:
         return BlindEnv(**kwargs)
     env_class = RuleDrivenEnv if contender.contender == DRIVEN else HighwayVisionEnv
-    kwargs["scenario"] = contender.scenario
+    kwargs["scenario"] = contender.scenario or "highway"
     return env_class(contender.weather, contender.modalities, contender.image_size, **kwargs)
 
 

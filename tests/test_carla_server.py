@@ -121,8 +121,8 @@ def test_a_training_and_its_evaluation_as_configured(
     monkeypatch: pytest.MonkeyPatch, server: Server, env: CarlaVisionEnv
 ) -> None:
     config = load_config("havesac", "CarlaVision-v0")
-    kwargs = evaluation_env_kwargs(config)
-    other = Server(port=kwargs["port"])
+    kwargs = evaluation_env_kwargs(config) | {"port": 2010, "tm_port": 8010}  # --eval-env-kwargs
+    other = Server(port=2010)
     install(monkeypatch, server, other)
     training = CarlaVisionEnv(**{**BRIEF, **config["env_kwargs"]})
     evaluation = CarlaVisionEnv(**{**BRIEF, **kwargs})
