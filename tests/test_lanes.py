@@ -19,6 +19,7 @@ from sb3_have.envs.road_shape import (
     RAMP_TAPERS,
     SCENARIOS,
     SWING,
+    RoadShape,
     road_shape,
 )
 
@@ -38,8 +39,10 @@ def test_slopes_are_derivatives_and_everything_is_periodic(scenario: str) -> Non
     np.testing.assert_allclose((shape.bend(x + step) - shape.bend(x - step)) / (2 * step), shape.slope(x), atol=1e-7)
     for k in range(2):
         change = (shape.ramp(x + step)[k] - shape.ramp(x - step)[k]) / (2 * step)
-        if scenario == "merge":
-            np.testing.assert_allclose(change, shape.ramp_slope(x)[k], atol=1e-6)
+        np.testing.assert_allclose(change, shape.ramp_slope(x)[k], atol=1e-6)
+        assert shape.ramps or (shape.ramp(x)[k] == shape.right_edge).all()
+        assert (np.asarray(shape.ramp(0.0)[k]) == shape.right_edge) == (not shape.ramps)
+    np.testing.assert_array_equal(shape.has_ramp(x), shape.ramps & (x % PERIOD < RAMP_ENDS))
     for f in (shape.bend, shape.slope, lambda u: shape.ramp(u)[0], lambda u: shape.ramp(u)[1]):
         np.testing.assert_allclose(f(x + PERIOD), f(x), atol=1e-9)
         np.testing.assert_allclose([f(float(u)) for u in x], f(x), atol=1e-9)
@@ -66,6 +69,7 @@ def test_the_car_can_follow_the_curves_comfortably() -> None:
     assert 1 / curvature.max() == pytest.approx(486, abs=2)
     # highway-env's bicycle: turning radius LENGTH / 2 / sin(slip angle) at full lock
     lock = 2.5 / math.sin(math.atan(0.5 * math.tan(0.02)))
+    assert lock == pytest.approx(250, abs=1)
     assert lock * 1.5 < 1 / curvature.max()
 
 
@@ -122,6 +126,19 @@ def test_ramp_lane() -> None:
         closest = network.get_closest_lane_index(point)
         assert closest == (*FORWARD, index) and network.get_lane(closest).on_lane(point) == on, (u, y)
     assert not ramp.is_reachable_from(np.array([RAMP_START + 300.0, 4.0]))
+
+
+def test_occupants_of_lanes_of_another_width() -> None:
+    shape = RoadShape(lanes_count=2, lane_width=6.0, swing=SWING)
+    network = ShapedNetwork(shape)
+    env = BlindEnv(vehicles_count=0)
+    env.reset(seed=0)
+    x, car = 1000.0, env.vehicle
+    y = 6.0 + float(shape.bend(x))
+    for across, inside in [(0.0, True), (-3.9, True), (3.9, True), (4.1, False), (-4.1, False)]:
+        occupants = network.get_lane((*FORWARD, 1)).occupants([(x, y + across, car)])
+        assert occupants == [(x, car)] * inside
+        assert network.get_lane((*FORWARD, 1)).on_lane(np.array([x, y + across]), margin=1) == inside
 
 
 @pytest.mark.parametrize("scenario", NEW)

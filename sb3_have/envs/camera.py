@@ -23,6 +23,7 @@ from sb3_have.envs.scene import (
     BODY,
     FRONT,
     FRONT_LIT,
+    RAIL_PIECE,
     TEXTURE_COLUMNS,
     TEXTURE_ROWS,
     TEXTURES,
@@ -173,6 +174,10 @@ class Camera:
             vehicle = faces.vehicle[instant, face]
             middle = np.concatenate((np.hypot(forward, right), 0.0 * every), axis=1)
             away = np.where(vehicle < 0, away, middle[instant, vehicle])
+            # A piece of rail counts by its farther end: all that stands behind rails is still farther.
+            place = np.concatenate((traffic[..., :2], np.zeros((len(poses), 1, 2))), axis=1)[instant, vehicle]
+            place = np.where(vehicle[:, None] < 0, 0.5 * (faces.start + faces.end)[instant, face], place)
+            away += RAIL_PIECE * (self.roadside.behind_rail(place) + (faces.kind[instant, face] == TREE))
             order = np.argsort(-away, kind="stable")
             instant, face = instant[order], face[order]
         start, end = start[instant, face], end[instant, face]

@@ -12,19 +12,18 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_have.envs.road_shape import PERIOD, RAMP_ENDS, RAMP_JOINS, RoadShape
+from sb3_have.envs.road_shape import PERIOD, RAMP_ENDS, RAMP_JOINS, SHOULDER_WIDTH, RoadShape
 from sb3_have.envs.scene import (
     CENTRE_LINES,
     DASH_LENGTH,
     DASH_PERIOD,
     LINE_WIDTH,
     RAMP_DASH_PERIOD,
-    SHOULDER_WIDTH,
     Array,
     IntArray,
 )
 
-#: A pixel's footprint is taken to be no longer than this [m].
+#: A pixel's footprint is taken to be no longer than this [m], less than what has a beginning and an end on any road.
 LONGEST: Final = 200.0
 
 
@@ -54,8 +53,7 @@ class GroundView:
 
     def __init__(self, shape: RoadShape, forward: Array, right: Array, focal: float, height: float) -> None:
         self.shape, self.forward, self.right = shape, forward, right
-        self.middle = np.float32(0.5 * (shape.lanes_count - 1) * shape.lane_width)
-        self.half_width = np.float32(0.5 * shape.lanes_count * shape.lane_width + SHOULDER_WIDTH)
+        self.middle, self.half_width = np.float32(shape.middle), np.float32(shape.half_width)
         #: Size of a pixel on the ground, (rows, 1).
         self.wide = forward / np.float32(focal)
         self.long = np.minimum(self.wide * forward / np.float32(height), np.float32(LONGEST))
@@ -75,7 +73,7 @@ class GroundView:
         span, narrow = self.wide, None
         if shape.swing:
             across = across - shape.bend(along)
-            span, narrow = self._footprint(shape.slope(along), sin, cos)
+            span, narrow = _footprint(self.wide, self.long, shape.slope(along), sin, cos)
 
         lane = across / width + np.float32(0.5)
         line: Array = np.clip(np.rint(lane), 0, shape.lanes_count)
@@ -86,16 +84,19 @@ class GroundView:
         marking = _line_share(distance, span)
         road = np.clip(np.float32(0.5) - beyond / span, 0, 1)
         # Lines between lanes are dashed.
-        between = (marking != 0) & (line > 0) & (line < shape.lanes_count)
+        inner = (marking != 0) & (line > 0) & (line < shape.lanes_count)
         if shape.oncoming:
             self._draw_centre(marking, line, distance, span)
-            between &= line != shape.oncoming
-        self._dash(marking, along, np.flatnonzero(between), DASH_PERIOD)
+            inner &= line != shape.oncoming
+        between = np.flatnonzero(inner)
+        marking.reshape(-1)[between] *= self._dashes(along, between, DASH_PERIOD)
         if shape.ramps:
-            beside = (along % PERIOD >= RAMP_JOINS) & (along % PERIOD < RAMP_ENDS)
-            opened = np.flatnonzero((marking != 0) & (line == shape.lanes_count) & beside)
-            self._dash(marking, along, opened, RAMP_DASH_PERIOD)
-            self._add_ramp(marking, road, along, across, sin, cos)
+            # As is the road's edge beside the lane that a ramp becomes.
+            beside = _share_between(along % PERIOD, self.long, RAMP_JOINS, RAMP_ENDS)
+            opened = np.flatnonzero((marking != 0) & (line == shape.lanes_count) & (beside != 0))
+            gaps = 1 - self._dashes(along, opened, RAMP_DASH_PERIOD)
+            marking.reshape(-1)[opened] *= 1 - beside.take(opened) * gaps
+            self._add_ramps(marking, road, along, across, sin, cos)
 
         # Patches of 1 m average out where they are smaller than a pixel.
         patch = (np.floor(along).astype(np.int32) & 63) * 64 + (np.floor(across).astype(np.int32) & 63)
@@ -103,21 +104,12 @@ class GroundView:
         verge = 1 + (patches - 1) * np.minimum(1, 2 / np.maximum(self.wide, self.long))
         return Ground(road, marking, verge)
 
-    def _footprint(self, slope: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
-        """
-        Extent of a pixel's footprint square to a line of this slope, and the factor that turns distances along y into
-        distances square to the line.
-        """
-        narrow = 1 / np.sqrt(1 + slope * slope)
-        along, aside = (cos + sin * slope) * narrow, (sin - cos * slope) * narrow
-        return self.wide * np.abs(along) + self.long * np.abs(aside), narrow
-
-    def _dash(self, marking: Array, along: Array, dashed: IntArray, period: float) -> None:
-        """Leave less paint, by the share of the pixel's length that dashes cover."""
+    def _dashes(self, along: Array, dashed: IntArray, period: float) -> Array:
+        """Share of these pixels' length that dashes cover."""
         middle = along.take(dashed)
         length = self.long[dashed // along.shape[2] % len(self.long), 0]
         paint = _painted_length(middle + length / 2, period) - _painted_length(middle - length / 2, period)
-        marking.reshape(-1)[dashed] *= paint / length
+        return np.asarray(paint / length)
 
     def _draw_centre(self, marking: Array, line: Array, distance: Array, span: Array) -> None:
         """Two solid lines side by side between the directions."""
@@ -126,19 +118,51 @@ class GroundView:
         both = _line_share(np.abs(distance - CENTRE_LINES), span) + _line_share(distance + CENTRE_LINES, span)
         marking.reshape(-1)[centre] = np.minimum(both, 1)
 
-    def _add_ramp(self, marking: Array, road: Array, along: Array, across: Array, sin: Array, cos: Array) -> None:
-        """The pavement and the two solid lines of a ramp; its left line ends where the ramp joins the road."""
-        edges, slopes = self.shape.ramp(along), self.shape.ramp_slope(along)
+    def _add_ramps(self, marking: Array, road: Array, along: Array, across: Array, sin: Array, cos: Array) -> None:
+        """The ramp that began last before each pixel, and the one that begins within its footprint."""
+        since = along % PERIOD
+        self._draw_ramp(marking, road, since, across, sin, cos, slice(None))
+        rows = np.flatnonzero((since + self.long / 2 > PERIOD).any(axis=(0, 2)))
+        if len(rows):
+            self._draw_ramp(marking, road, since - PERIOD, across, sin, cos, slice(rows[0], rows[-1] + 1))
+
+    def _draw_ramp(
+        self, marking: Array, road: Array, since: Array, across: Array, sin: Array, cos: Array, rows: slice
+    ) -> None:
+        """
+        The pavement and the two solid lines of a ramp; its left line ends where the ramp joins the road.
+
+        :param since: Metres since it began, negative before.
+        :param rows: Which to draw.
+        """
+        marking, road, since, across = marking[:, rows], road[:, rows], since[:, rows], across[:, rows]
+        wide, long, u = self.wide[rows], self.long[rows], np.maximum(since, 0)
+        covered = _share_between(since, long, 0, RAMP_ENDS)
+        edges, slopes = self.shape.ramp(u), self.shape.ramp_slope(u)
         beyond: list[Array] = []
         for sign, edge, slope in zip((1, -1), edges, slopes, strict=True):
-            span, narrow = self._footprint(slope, sin, cos)
+            span, narrow = _footprint(wide, long, slope, sin, cos)
             outside = sign * (edge - across) * narrow
             beyond.append((outside - SHOULDER_WIDTH) / span)
             paint = _line_share(np.abs(outside), span)
-            if sign > 0:
-                paint *= along % PERIOD < RAMP_JOINS
+            paint *= covered if sign < 0 else _share_between(since, long, 0, RAMP_JOINS)
             np.maximum(marking, paint, out=marking)
-        np.maximum(road, np.clip(np.float32(0.5) - np.maximum(*beyond), 0, 1), out=road)
+        np.maximum(road, covered * np.clip(np.float32(0.5) - np.maximum(*beyond), 0, 1), out=road)
+
+
+def _footprint(wide: Array, long: Array, slope: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
+    """
+    Extent of a pixel's footprint square to a line of this slope, and the factor that turns distances along y into
+    distances square to the line.
+    """
+    narrow = 1 / np.sqrt(1 + slope * slope)
+    along, aside = (cos + sin * slope) * narrow, (sin - cos * slope) * narrow
+    return wide * np.abs(along) + long * np.abs(aside), narrow
+
+
+def _share_between(x: Array, length: Array, first: float, last: float) -> Array:
+    """Share of a footprint of this length, its middle at x, that lies between two places farther apart than that."""
+    return np.clip(np.minimum(x - np.float32(first), np.float32(last) - x) / length + np.float32(0.5), 0, 1)
 
 
 def _line_share(distance: Array, span: Array) -> NDArray[np.float32]:

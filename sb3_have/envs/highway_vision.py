@@ -20,6 +20,9 @@ from sb3_have.envs.road_shape import PERIOD, road_shape
 from sb3_have.envs.vision import VisionSensors, compose
 from sb3_have.envs.weather import weather_choices
 
+MIN_FREQUENCY_HEAD_ON = 2
+"""Least simulation frequency at which cars that meet head-on are seen to collide [Hz]."""
+
 START_X = 1000.0
 """Where the ego vehicle starts along the road [m]: far from the road's own ends."""
 
@@ -63,10 +66,10 @@ class HighwayVisionEnv(AbstractEnv):
     - "merge": the same with an on-ramp from the right every 480 m. Its slow traffic speeds up on an acceleration lane
       of 180 m and cuts in where MOBIL holds it to be safe, less and less choosy towards the end. The ego vehicle may
       drive there, too, while the lane lasts;
-    - "curves": a winding road, a sine of 12 m and period 480 m (radius 486 m and more: two thirds of the default
-      ``steering_range`` at most), half of its lanes for oncoming traffic behind a double solid line. Driving there is
-      possible and counts as road, but its traffic is bound to come; it brakes for who comes head-on, and never changes
-      sides itself.
+    - "curves": a winding road, a sine of 12 m and period 480 m (radius 486 m and more; full lock of the default
+      ``steering_range`` is 250 m), half of its lanes for oncoming traffic behind a double solid line. Driving there
+      is possible and counts as road, but its traffic is bound to come; it brakes for who comes head-on, and never
+      changes sides itself.
 
     In the latter two the ego vehicle starts at a random place of the period.
 
@@ -80,7 +83,7 @@ class HighwayVisionEnv(AbstractEnv):
     :param lanes_count: number of lanes in all, not counting ramps; even in "curves"
     :param max_episode_steps: control steps per episode, or None for no limit
     :param initial_speed: of the ego vehicle [m/s], in 0 to ``max_speed``
-    :param simulation_frequency: [Hz], a multiple of ``policy_frequency``
+    :param simulation_frequency: [Hz], a multiple of ``policy_frequency``, and 2 or more in "curves"
     :param policy_frequency: control steps per second [Hz]
     :param steering_range: steering angle at full lock [rad]
     :param max_speed: top speed [m/s]; the car does not reverse
@@ -135,6 +138,11 @@ class HighwayVisionEnv(AbstractEnv):
                 f"simulation_frequency ({simulation_frequency} Hz) must be a multiple of "
                 f"policy_frequency ({policy_frequency} Hz), or control steps would lose time"
             )
+        if scenario == "curves" and simulation_frequency < MIN_FREQUENCY_HEAD_ON:
+            raise ValueError(
+                f"simulation_frequency must be >= {MIN_FREQUENCY_HEAD_ON} Hz in scenario 'curves', or cars would pass "
+                f"through each other head-on; got {simulation_frequency!r}"
+            )
         for name, positive in [("max_speed", max_speed), ("steering_range", steering_range)]:
             if not (np.isfinite(positive) and positive > 0):
                 raise ValueError(f"{name} must be positive, got {positive!r}")
@@ -161,11 +169,9 @@ class HighwayVisionEnv(AbstractEnv):
         self.sensors = VisionSensors(
             image_size=image_size,
             modalities=modalities,
-            lanes_count=self.lanes_count,
-            lane_width=LANE_WIDTH,
             event=None if event is None else dict(event),
             depth=None if depth is None else dict(depth),
-            scenario=scenario,
+            shape=self.shape,
         )
         self._fixed_action_space = spaces.Box(-1.0, 1.0, shape=(2,), dtype=np.float32)
         frequencies = {"simulation_frequency": simulation_frequency, "policy_frequency": policy_frequency}

@@ -9,12 +9,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from highway_env.road.lane import LineType
 from highway_env.road.road import LaneIndex, RoadNetwork
 from highway_env.vehicle.kinematics import Vehicle
 
-from sb3_have.envs.road import LANE_WIDTH, ROAD_LENGTH, SPEED_LIMIT, AxisLane
-from sb3_have.envs.road_shape import PERIOD, RAMP_ENDS, RoadShape
+from sb3_have.envs.road import ROAD_LENGTH, SPEED_LIMIT, AxisLane
+from sb3_have.envs.road_shape import RoadShape
 
 FORWARD, ONCOMING = ("0", "1"), ("1", "0")
 """The two directions in a lane index; lane 0 is the leftmost of those who drive it."""
@@ -30,7 +29,7 @@ class BentLane(AxisLane):
 
     def __init__(self, shape: RoadShape, number: int) -> None:
         y = number * shape.lane_width
-        super().__init__([0.0, y], [ROAD_LENGTH, y], line_types=_line_types(shape, number), speed_limit=SPEED_LIMIT)
+        super().__init__([0.0, y], [ROAD_LENGTH, y], width=shape.lane_width, speed_limit=SPEED_LIMIT)
         self.shape = shape
         self.sign = -1.0 if number < shape.oncoming else 1.0
 
@@ -47,7 +46,7 @@ class BentLane(AxisLane):
         return along if self.sign > 0 else along + math.pi
 
     def occupants(self, placed: list[tuple[float, float, Vehicle]]) -> list[tuple[float, Vehicle]]:
-        sign, reach = self.sign, LANE_WIDTH / 2 + 1
+        sign, reach = self.sign, self.shape.lane_width / 2 + 1
         return [(sign * x, vehicle) for x, y, vehicle in placed if abs(y - self._y(x)) <= reach]
 
     def _mirrored(self, x: float) -> float:
@@ -76,15 +75,11 @@ class RampLane(BentLane):
     ) -> bool:
         x, y = float(position[0]), float(position[1])
         left, right = self.shape.ramp(x)
-        return self.exists(x) and left - margin <= y <= right + margin
+        return bool(self.shape.has_ramp(x)) and left - margin <= y <= right + margin
 
     def occupants(self, placed: list[tuple[float, float, Vehicle]]) -> list[tuple[float, Vehicle]]:
         edge = self.shape.right_edge - 1
         return [(x, v) for x, y, v in placed if y >= edge and self.on_lane(v.position, margin=1)]
-
-    def exists(self, x: float) -> bool:
-        """Whether there is a ramp at x."""
-        return x % PERIOD < RAMP_ENDS
 
     def _y(self, x: float) -> float:
         return float(self.shape.ramp(x)[0]) + 0.5 * self.shape.lane_width
@@ -117,16 +112,10 @@ class ShapedNetwork(RoadNetwork):
         shape, x, y = self.shape, float(position[0]), float(position[1])
         across = y - shape.bend(x)
         number = min(max(round(across / shape.lane_width), 0), shape.lanes_count - 1)
-        if self.ramp is not None and across > shape.right_edge and self.ramp.exists(x):
+        if self.ramp is not None and across > shape.right_edge and shape.has_ramp(x):
             past_road, past_ramp = across - shape.right_edge, abs(self.ramp.local_coordinates(position)[1])
             if past_ramp < past_road + 0.5 * shape.lane_width:
                 return *FORWARD, shape.lanes_count
         if number < shape.oncoming:
             return *ONCOMING, shape.oncoming - 1 - number
         return *FORWARD, number - shape.oncoming
-
-
-def _line_types(shape: RoadShape, number: int) -> tuple[LineType, LineType]:
-    """Lines to the left and to the right, as seen with +x ahead; every line belongs to one lane."""
-    left = LineType.CONTINUOUS_LINE if number in (0, shape.oncoming) else LineType.STRIPED
-    return left, LineType.CONTINUOUS_LINE if number == shape.lanes_count - 1 else LineType.NONE

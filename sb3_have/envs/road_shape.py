@@ -25,6 +25,9 @@ RAMP_JOINS: Final = 240.0
 RAMP_TAPERS: Final = 420.0
 RAMP_ENDS: Final = 460.0
 
+#: The pavement goes on beyond the outer lines [m].
+SHOULDER_WIDTH: Final = 2.0
+
 SCENARIOS: Final = ("highway", "merge", "curves")
 
 
@@ -56,6 +59,16 @@ class RoadShape:
         """Across coordinate of the right edge of the right-most lane, not counting ramps."""
         return (self.lanes_count - 0.5) * self.lane_width
 
+    @property
+    def middle(self) -> float:
+        """Across coordinate of the middle of the road, not counting ramps."""
+        return 0.5 * (self.lanes_count - 1) * self.lane_width
+
+    @property
+    def half_width(self) -> float:
+        """Half the width of the pavement, shoulders included, not counting ramps."""
+        return 0.5 * self.lanes_count * self.lane_width + SHOULDER_WIDTH
+
     def bend(self, x: Any) -> Any:
         """How far the road lies to the right of the x axis [m]."""
         return self.swing * _sin(2 * math.pi / PERIOD * x)
@@ -71,8 +84,14 @@ class RoadShape:
         heading = math.atan(self.slope(x))
         return math.cos(heading), math.sin(heading)
 
+    def has_ramp(self, x: Any, until: float = RAMP_ENDS) -> Any:
+        """Whether there is a ramp at x that began less than so many metres before."""
+        return self.ramps & (x % PERIOD < until)
+
     def ramp(self, x: Any) -> tuple[Any, Any]:
         """Across coordinates of a ramp's left and right edge; both are the road's own edge where there is no ramp."""
+        if not self.ramps:
+            return self.right_edge + 0 * x, self.right_edge + 0 * x
         u = x % PERIOD
         offset = RAMP_OFFSET * _positive(1 - u / RAMP_JOINS) ** 2
         taper = (u - RAMP_TAPERS) / (RAMP_ENDS - RAMP_TAPERS)
@@ -81,6 +100,8 @@ class RoadShape:
 
     def ramp_slope(self, x: Any) -> tuple[Any, Any]:
         """Derivatives of the edges that :meth:`ramp` returns."""
+        if not self.ramps:
+            return 0 * x, 0 * x
         u = x % PERIOD
         left = -2 * RAMP_OFFSET / RAMP_JOINS * _positive(1 - u / RAMP_JOINS)
         tapering = 0.5 * (np.sign(u - RAMP_TAPERS) - np.sign(u - RAMP_ENDS))
@@ -103,7 +124,7 @@ def road_shape(scenario: str, lanes_count: int, lane_width: float = 4.0) -> Road
         if lanes_count % 2:
             raise ValueError(
                 f"lanes_count must be even in scenario 'curves', which has half of the lanes in either direction; "
-                f"got {lanes_count}, choose {max(2, lanes_count - 1)} or {lanes_count + 1}"
+                f"got {lanes_count}, choose {f'{lanes_count - 1} or ' if lanes_count > 1 else ''}{lanes_count + 1}"
             )
         return RoadShape(lanes_count, lane_width, swing=SWING, oncoming=lanes_count // 2)
     return RoadShape(lanes_count, lane_width, ramps=scenario == "merge")

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_have.envs.road_shape import PERIOD, RoadShape
+from sb3_have.envs.road_shape import PERIOD, SHOULDER_WIDTH, RoadShape
 
 Array = NDArray[np.floating]
 IntArray = NDArray[np.integer]
@@ -51,7 +51,6 @@ MARKING: Final = np.array((0.70, 0.70, 0.68), dtype=np.float32)
 VERGE: Final = np.array((0.10, 0.17, 0.05), dtype=np.float32)
 
 VEHICLE_HEIGHT: Final = 1.5
-SHOULDER_WIDTH: Final = 2.0
 LINE_WIDTH: Final = 0.2
 DASH_LENGTH: Final = 3.0
 DASH_PERIOD: Final = 12.0
@@ -63,6 +62,8 @@ CENTRE_LINES: Final = 0.2
 #: A multiple of all that repeats on its own: the road's shape, dashes (12 m), trees (20 m), joints (4 m) and the verge
 #: (64 m).
 WORLD_PERIOD: Final = 2 * PERIOD
+#: Guard-rails stand so far beyond the pavement.
+RAIL_SETBACK: Final = 0.5
 RAIL_BOTTOM: Final = 0.45
 RAIL_TOP: Final = 0.8
 RAIL_JOINTS: Final = 4.0
@@ -150,9 +151,6 @@ class Roadside:
 
     def __init__(self, shape: RoadShape) -> None:
         self.shape = shape
-        self.middle = 0.5 * (shape.lanes_count - 1) * shape.lane_width
-        #: Half the width of the paved road with its shoulders.
-        self.half_width = 0.5 * shape.lanes_count * shape.lane_width + SHOULDER_WIDTH
         jitter = (int(WORLD_PERIOD / TREE_SPACING), 2, 2)
         self._jitter = np.random.default_rng(0).uniform(-1, 1, jitter) * (4.0, 2.5)
 
@@ -165,12 +163,22 @@ class Roadside:
         """
         return self._trees(x), self._rail(x, sight) if self.shape.plain else self._pieces(x, sight)
 
+    def behind_rail(self, points: Array) -> Array:
+        """
+        How far points (..., 2) stand behind the road's own right rail, where a ramp is: 0 from the road to the rail, 1
+        from the ramp on, and between the two so gradually that who is farther along never comes to stand before others.
+        """
+        if not self.shape.ramps:
+            return np.zeros(points.shape[:-1])
+        rail = self.shape.middle + self.shape.half_width + RAIL_SETBACK
+        return np.clip((points[..., 1] - rail) / self.shape.lane_width, 0, 1)
+
     def _trees(self, x: Array) -> Faces:
         # Every instant has the faces around its own x, so that it looks the same whichever others are rendered with it.
         number = (x[:, None] // TREE_SPACING).astype(np.int64) + np.arange(int(TREE_RANGE / TREE_SPACING), -1, -1)
         tree = self._jitter[number % len(self._jitter)]
         tree[..., 0] += TREE_SPACING * number[..., None]
-        tree[..., 1] += self.middle + np.array((-1, 1)) * (self.half_width + 5)
+        tree[..., 1] += self.shape.middle + np.array((-1, 1)) * (self.shape.half_width + 5)
         if not self.shape.plain:
             tree[..., 1] += self.shape.bend(tree[..., 0])
             tree[:, :, 1, 1] += self._widening(tree[:, :, 1, 0])
@@ -191,7 +199,7 @@ class Roadside:
     def _rail(self, x: Array, sight: float) -> Faces:
         """The left and the right rail of a plain road, in one piece each."""
         near, far = x - 5, x + sight
-        y = np.tile(self.middle + np.array((-1, 1)) * (self.half_width + 0.5), (len(x), 1))
+        y = np.tile(self.shape.middle + np.array((-1, 1)) * (self.shape.half_width + RAIL_SETBACK), (len(x), 1))
         s_near = near % RAIL_JOINTS / RAIL_JOINTS
         s_far = s_near + (far - near) / RAIL_JOINTS
         ends = (np.stack((near, far), axis=1), np.stack((far, near), axis=1))
@@ -203,8 +211,8 @@ class Roadside:
         number = x[:, None] // RAIL_PIECE + np.arange(-1, int(sight / RAIL_PIECE) + 1)
         # Just inside of the piece, for where a ramp begins there is a step.
         near, far = RAIL_PIECE * number + 1e-3, RAIL_PIECE * (number + 1) - 1e-3
-        shift = self.half_width + 0.5
-        left, right = self.middle - shift, self.middle + shift
+        shift = self.shape.half_width + RAIL_SETBACK
+        left, right = self.shape.middle - shift, self.shape.middle + shift
         ends = [(np.stack((u, left + self.shape.bend(u)), axis=-1)) for u in (near, far)]
         outer = [(np.stack((u, right + self.shape.bend(u) + self._widening(u)), axis=-1)) for u in (far, near)]
         starts, stops = [ends[0], outer[0]], [ends[1], outer[1]]
@@ -220,8 +228,6 @@ class Roadside:
 
     def _widening(self, x: Array) -> Array:
         """How far a ramp's right edge lies beyond the road's own."""
-        if not self.shape.ramps:
-            return np.zeros_like(x)
         return np.asarray(self.shape.ramp(x)[1]) - self.shape.right_edge
 
 

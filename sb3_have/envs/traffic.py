@@ -17,7 +17,7 @@ from sb3_have.envs.driver import Driver, ScenarioDriver
 from sb3_have.envs.lanes import FORWARD, ONCOMING, ShapedNetwork
 from sb3_have.envs.merging import MergingDriver
 from sb3_have.envs.road import ROAD_LENGTH
-from sb3_have.envs.road_shape import PERIOD, RAMP_JOINS
+from sb3_have.envs.road_shape import RAMP_JOINS
 
 SIGHT = 300.0
 """No vehicle appears nearer than this ahead of the ego vehicle [m]."""
@@ -28,7 +28,7 @@ BEHIND = 120.0
 RAMP_SPEED = (10.0, 13.0)
 """Range of speeds at which ramps are driven [m/s]."""
 BEHIND_RAMP = 40.0
-"""Rear end of the window while a ramp begins out of sight ahead [m]: who is farther behind is needed there."""
+"""While a ramp begins out of sight ahead, who is farther behind [m] and too slow to come nearer is needed there."""
 RAMP_ENTRY = 100.0
 """Who arrives on a ramp arrives within this distance from its beginning [m]."""
 
@@ -72,10 +72,11 @@ def recycle(road: Road, ego: Vehicle, speeds: tuple[float, float], rng: np.rando
     :return: indices into ``road.vehicles`` of the vehicles that were replaced
     """
     replaced = []
-    behind = BEHIND_RAMP if _on_ramp(road, ego.position[0] + SIGHT, RAMP_ENTRY) else BEHIND
+    called = _on_ramp(road, ego.position[0] + SIGHT, RAMP_ENTRY)
     for i, vehicle in enumerate(road.vehicles):
         offset = vehicle.position[0] - ego.position[0]
-        if vehicle is ego or -behind <= offset <= AHEAD:
+        needed = called and offset < -BEHIND_RAMP and vehicle.speed <= ego.speed
+        if vehicle is ego or (-BEHIND <= offset <= AHEAD and not needed):
             continue
         oncoming = vehicle.lane_index[:2] == ONCOMING
         at_front = offset < 0 or oncoming
@@ -85,6 +86,7 @@ def recycle(road: Road, ego: Vehicle, speeds: tuple[float, float], rng: np.rando
         if _has_room(newcomer):
             road.vehicles[i] = newcomer
             replaced.append(i)
+            called = called and not needed  # one at a time
     return replaced
 
 
@@ -102,7 +104,7 @@ def _open_lanes(road: Road, x: float, ramp_until: float) -> list[LaneIndex]:
 
 def _on_ramp(road: Road, x: float, until: float) -> bool:
     """Whether x lies in the first metres of a ramp."""
-    return isinstance(road.network, ShapedNetwork) and road.network.ramp is not None and x % PERIOD < until
+    return isinstance(road.network, ShapedNetwork) and bool(road.network.shape.has_ramp(x, until))
 
 
 def _random_vehicle(

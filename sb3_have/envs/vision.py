@@ -12,7 +12,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from sb3_have.envs.camera import Camera, Objects
-from sb3_have.envs.road_shape import road_shape
+from sb3_have.envs.road_shape import RoadShape
 from sb3_have.envs.scene import PAINTS, Array
 from sb3_have.envs.weather import Illumination, rain_events, take_picture, weather_by_name
 from sb3_have.sensors.depth import encode_depth
@@ -58,9 +58,6 @@ class VisionSensors:
 
     :param image_size: Rows and columns of every image.
     :param modalities: Non-empty subset of ``"rgb"``, ``"event"``, ``"depth"``.
-    :param lanes_count: Lanes of the road; where it is straight, the centre of lane k lies at y = k * lane_width, y to
-        the right.
-    :param lane_width: In metres.
     :param event: Overrides of :data:`EVENT_DEFAULTS`: ``bins``, ``subframes`` (instants rendered per control step),
         ``representation`` and, for a time surface, ``tau`` as :func:`~sb3_have.sensors.represent` has them (one control
         step each), and the parameters of :class:`~sb3_have.sensors.EventCamera`. ``seed`` fixes the chip's threshold
@@ -68,7 +65,7 @@ class VisionSensors:
         other than "log" the event camera sees the digital numbers of the colour camera, neither clipped nor rounded.
     :param depth: Overrides of :data:`DEPTH_DEFAULTS`: ``encoding`` ("log", "clipped", "inverse") and, for the latter
         two, ``max`` in metres.
-    :param scenario: The road, see :func:`~sb3_have.envs.road_shape.road_shape`.
+    :param shape: Of the road, as :func:`~sb3_have.envs.road_shape.road_shape` has them; 4 straight lanes by default.
     :raises ValueError: on an unknown modality, option or value.
     """
 
@@ -76,18 +73,13 @@ class VisionSensors:
         self,
         image_size: int = 84,
         modalities: Sequence[str] = MODALITIES,
-        lanes_count: int = 4,
-        lane_width: float = 4.0,
         event: Mapping[str, Any] | None = None,
         depth: Mapping[str, Any] | None = None,
-        scenario: str = "highway",
+        shape: RoadShape | None = None,
     ) -> None:
         if isinstance(modalities, str) or not modalities or not set(modalities) <= set(MODALITIES):
             raise ValueError(f"modalities must be a non-empty subset of {MODALITIES}, got {modalities!r}")
         self.image_size = image_size = _whole("image_size", image_size, 16)
-        lanes_count = _whole("lanes_count", lanes_count, 1)
-        if not lane_width > 0:
-            raise ValueError(f"lane_width must be > 0, got {lane_width}")
         self.modalities = tuple(name for name in MODALITIES if name in modalities)
         self.event_options = _options("event", EVENT_DEFAULTS, event)
         self.depth_options = _options("depth", DEPTH_DEFAULTS, depth)
@@ -99,7 +91,7 @@ class VisionSensors:
                 f"depth max={self.depth_options['max']!r} has no effect with encoding 'log', whose range is fixed; "
                 "leave it out or choose encoding 'clipped' or 'inverse'"
             )
-        self.camera = Camera(image_size, road_shape(scenario, lanes_count, lane_width))
+        self.camera = Camera(image_size, shape or RoadShape(4))
 
         chip = dict(self.event_options)
         self.bins = _whole("event bins", chip.pop("bins"), 1)

@@ -264,7 +264,7 @@ class Illumination:
         radiance = self.albedo.take(objects.material, axis=1) * received
         if self.weather.night:
             radiance[:, np.flatnonzero(objects.material == LAMP)] += self.tail
-            if self.camera.shape.oncoming:
+            if self.camera.shape.oncoming:  # or there are none, and no need to search the samples for them
                 radiance[:, np.flatnonzero(objects.material == HEADLAMP)] += self.head
         return np.asarray(radiance * haze + self.horizon * (1 - haze))
 
