@@ -1,5 +1,6 @@
 """The pictures of scenarios "merge" and "curves": markings, pavement and cars are drawn where the lanes are."""
 
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -7,11 +8,12 @@ import pytest
 from highway_env.road.lane import AbstractLane
 from numpy.typing import NDArray
 
+from benchmarks.rule_driven import RuleDrivenEnv
 from sb3_have.envs.camera import Camera
 from sb3_have.envs.lanes import FORWARD, ONCOMING, ShapedNetwork
 from sb3_have.envs.road import ROAD_LENGTH
-from sb3_have.envs.road_shape import PERIOD, RAMP_TAPERS, road_shape
-from sb3_have.envs.scene import DASH_LENGTH, LINE_WIDTH, RAMP_DASH_PERIOD, SHOULDER_WIDTH, STEEL, WORLD_PERIOD
+from sb3_have.envs.road_shape import PERIOD, RAMP_ENDS, RAMP_JOINS, RAMP_TAPERS, SCENARIOS, SHOULDER_WIDTH, road_shape
+from sb3_have.envs.scene import DASH_LENGTH, LINE_WIDTH, RAIL_PIECE, RAMP_DASH_PERIOD, STEEL, WORLD_PERIOD
 from sb3_have.envs.vision import VisionSensors
 
 Array = NDArray[Any]
@@ -143,6 +145,27 @@ def test_the_edge_line_opens_beside_the_acceleration_lane_and_closes_behind_it()
     assert paint(300.0) == pytest.approx(DASH_LENGTH / RAMP_DASH_PERIOD, rel=0.05)
 
 
+@pytest.mark.parametrize("place", [0.0, RAMP_JOINS, RAMP_ENDS])
+def test_nothing_of_a_ramp_begins_or_ends_within_a_pixel(place: float) -> None:
+    camera, _ = road("merge")
+    halves = 0
+    for row in range(1, 10):
+        distance, length = float(camera.ground_forward[row, 0]), float(camera.ground_view.long[row, 0])
+        at = [
+            camera.ground(np.array([[(RAMP_START + place - 1 - distance + share * length, 12.0, 0.0)]]))
+            for share in (-0.51, -0.001, 0.0, 0.001, 0.51)
+        ]
+        for name in ("road", "marking"):
+            before, *middle, after = (getattr(ground, name)[0, row] for ground in at)
+            # 1 / 1000 of its length brings hardly any change.
+            assert np.abs(np.diff(middle, axis=0)).max() < 0.04, (row, name)
+            right = before < 0.01  # where there is no ramp yet
+            if place == 0 and name == "road" and after[right].max() > 0.99:
+                assert middle[1][right].max() == pytest.approx(0.5, abs=0.02)
+                halves += 1
+    assert halves > 0 or place > 0
+
+
 @pytest.mark.parametrize("scenario", NEW)
 def test_what_is_road_for_cars_is_pavement_and_little_else(scenario: str) -> None:
     """Every near pixel of the ground against the lanes: on a lane there is road, beyond the shoulder there is none."""
@@ -198,11 +221,61 @@ def test_cars_stand_between_the_lines_of_their_lane(index: Any, distance: float)
         assert len(front) and borders[0] - 1 < front.min() and front.max() < borders[1] + 1
 
 
-def test_a_rail_hides_the_ramp_behind_it_and_is_hidden_by_a_car_before_it() -> None:
+def test_a_car_far_to_the_side_is_seen() -> None:
+    camera, _ = road("merge")
+    poses = np.array([[(1000.0, 12.0, 0.0), (1061.0, 48.0, 0.0)]])
+    objects = camera.objects(poses, np.tile((5.0, 2.0), (2, 1)))
+    assert (objects.vehicle[objects.face] == 0).sum() > 20
+
+
+def hidden_but_painted(camera: Camera, poses: Array, sizes: Array) -> tuple[int, int]:
+    """Samples that show a face 0.3 m or more behind another one there, and samples that show any."""
+    faces = camera._project(poses, sizes)
+    painted = camera._paint(1, faces)[0]
+    u0, per_pixel, inverse, change = faces.plane[:4, :, None]
+    depth = 1 / (inverse + np.clip((camera._sample_u - u0) * per_pixel, 0, 1) * change)
+    nearest = np.full(painted.shape, np.inf)
+    for number in range(len(faces.instant)):
+        parts = {f.name: getattr(faces, f.name)[number : number + 1] for f in fields(faces) if f.name != "plane"}
+        alone = camera._paint(1, replace(faces, plane=faces.plane[:, number : number + 1], **parts))[0] != 0
+        nearest = np.where(alone, np.minimum(nearest, depth[number]), nearest)
+    row, column = np.nonzero(painted)
+    behind = depth[painted[row, column] - 1, column] - nearest[row, column]
+    return int((behind > 0.3).sum()), len(row)
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_every_sample_shows_what_is_nearest(scenario: str) -> None:
+    env = RuleDrivenEnv(scenario=scenario, modalities=("depth",), image_size=16, initial_speed=20.0)
+    camera = Camera(128, env.shape)
+    wrong = shown = 0
+    env.reset(seed=0)
+    sizes = np.array([(v.LENGTH, v.WIDTH) for v in env.road.vehicles])
+    for step in range(100):
+        env.step(np.zeros(2))
+        if step % 8 == 0:
+            here = hidden_but_painted(camera, env._snapshot()[None], sizes)
+            wrong, shown = wrong + here[0], shown + here[1]
+    assert shown > 10_000 and wrong < 2e-4 * shown
+
+
+@pytest.mark.parametrize("lane, u, ahead", [(0, 75.0, 50.0), (2, 110.0, 25.0), (3, 60.0, 15.0), (3, 90.0, 40.0)])
+def test_every_sample_shows_what_is_nearest_at_any_phase_of_the_rail(lane: int, u: float, ahead: float) -> None:
     camera, network = road("merge")
-    ego = on_lane(network.get_lane((*FORWARD, 0)), RAMP_START + 75.0)
-    on_ramp = on_lane(network.get_lane((*FORWARD, 4)), RAMP_START + 125.0)
-    beside = on_lane(network.get_lane((*FORWARD, 3)), RAMP_START + 105.0, 3.0)
+    sizes = np.tile((5.0, 2.0), (3, 1))
+    for phase in np.arange(0, RAIL_PIECE, 2.0):
+        ego = on_lane(network.get_lane((*FORWARD, lane)), RAMP_START + u + phase)
+        cars = [on_lane(network.get_lane((*FORWARD, i)), ego[0] + ahead) for i in (4, 3)]
+        wrong, shown = hidden_but_painted(camera, np.array([[ego, *cars]]), sizes)
+        assert shown > 5_000 and wrong < 2e-4 * shown
+
+
+@pytest.mark.parametrize("phase", np.arange(-4.0, RAIL_PIECE - 4, 3.0))
+def test_a_rail_hides_the_ramp_behind_it_and_is_hidden_by_a_car_before_it(phase: float) -> None:
+    camera, network = road("merge")
+    ego = on_lane(network.get_lane((*FORWARD, 0)), RAMP_START + phase + 75.0)
+    on_ramp = on_lane(network.get_lane((*FORWARD, 4)), RAMP_START + phase + 125.0)
+    beside = on_lane(network.get_lane((*FORWARD, 3)), RAMP_START + phase + 105.0, 3.0)
     for car, hidden in [(on_ramp, True), (beside, False)]:
         objects = camera.objects(np.array([[ego, car]]), np.tile((5.0, 2.0), (2, 1)))
         row, column = np.divmod(objects.pixel, SIZE)
@@ -231,6 +304,11 @@ def test_trees_and_rails_stand_beside_the_road_all_along(scenario: str) -> None:
             for point in (start, 0.5 * (start + end), end):
                 # In a piece the rail is straight, and a little nearer to the road or farther from it.
                 assert not on_road(point, SHOULDER_WIDTH + 0.2)
+        # What shines in the sun is the side that faces the road.
+        for start, end, normal in zip(rails.start[0], rails.end[0], rails.normal[0], strict=True):
+            if (start != end).any():
+                assert np.hypot(*normal) == pytest.approx(1) and (end - start) @ normal == pytest.approx(0, abs=1e-9)
+                assert on_road(0.5 * (start + end) + 4 * normal, 0.5)
         # Both sides have their rail everywhere: the outer one lies just behind the shoulder.
         near = [point for point in rails.start[0] if on_road(point, SHOULDER_WIDTH + 1.0)]
         assert len(near) >= 20
@@ -285,7 +363,7 @@ def test_oncoming_cars_have_lights_at_night() -> None:
     seen = []
     for index in ((*ONCOMING, 0), (*FORWARD, 0)):
         _, network = road("curves")
-        sensors = VisionSensors(96, ("rgb",), scenario="curves")
+        sensors = VisionSensors(96, ("rgb",), shape=road_shape("curves", 4))
         poses = np.array([on_lane(network.get_lane((*FORWARD, 0)), 1440.0), on_lane(network.get_lane(index), 1475.0)])
         image = sensors.reset("ClearNight", poses, np.tile((5.0, 2.0), (2, 1)), np.random.default_rng(0))["rgb"]
         seen.append(image[sensors.last_truth["vehicle"] == 0].min(axis=-1))
@@ -298,7 +376,7 @@ def test_oncoming_cars_have_lights_at_night() -> None:
 def test_a_standing_scene_makes_no_events_and_a_drive_does(scenario: str) -> None:
     _, network = road(scenario)
     lane = network.get_lane((*FORWARD, 1))
-    sensors, rng = VisionSensors(48, ("event",), scenario=scenario), np.random.default_rng(0)
+    sensors, rng = VisionSensors(48, ("event",), shape=road_shape(scenario, 4)), np.random.default_rng(0)
     poses, sizes = np.array([on_lane(lane, 1300.0), on_lane(lane, 1330.0)]), np.tile((5.0, 2.0), (2, 1))
     sensors.reset("ClearNoon", poses, sizes, rng)
     assert (sensors.observe(np.stack([poses, poses]), 0.2, rng)["event"] == 128).all()

@@ -15,6 +15,7 @@ from stable_baselines3.common.env_checker import check_env as check_sb3_env
 from benchmarks.road_identity import BlindEnv
 from sb3_have.envs import HighwayVisionEnv, traffic
 from sb3_have.envs.driver import ScenarioDriver
+from sb3_have.envs.highway_vision import HEAD_ON_FREQUENCY, START_X
 from sb3_have.envs.lanes import FORWARD, ONCOMING
 from sb3_have.envs.merging import MergingDriver
 from sb3_have.envs.road import ROAD_LENGTH
@@ -42,6 +43,13 @@ class RuleDrivenEnv(BlindEnv):
         ego = self.vehicle
         self.vehicle = IDMVehicle(self.road, ego.position, ego.heading, ego.speed, target_speed=25.0)
         self.road.vehicles[0] = self.vehicle
+
+
+class HeedlessDriver(ScenarioDriver):
+    """Neither brakes nor steers."""
+
+    def act(self, action: Any = None) -> None:
+        self.action = {"steering": 0.0, "acceleration": 0.0}
 
 
 def place(env: Any, x: float, y: float, heading: float = 0.0) -> None:
@@ -195,12 +203,60 @@ def test_past_the_end_of_the_ramp_it_is_on_the_road() -> None:
 
 @pytest.mark.parametrize("u, called", [(20.0, True), (95.0, True), (150.0, False), (470.0, False)])
 def test_a_ramp_that_begins_ahead_calls_for_cars_from_behind(u: float, called: bool) -> None:
-    env = BlindEnv(scenario="merge", vehicles_count=0)
+    env = BlindEnv(scenario="merge", vehicles_count=0, initial_speed=21.0)
     env.reset(seed=0)
     place(env, RAMP_START + u - traffic.SIGHT, 0.0)
-    car = MergingDriver.make_on_lane(env.road, (*FORWARD, 3), env.vehicle.position[0] - 60.0, 20.0)
-    env.road.vehicles.append(car)
-    assert traffic.recycle(env.road, env.vehicle, (21.0, 24.0), env.np_random) == [1] * called
+    # The first comes nearer, the second is needed yet, and one of the others at a time.
+    for lane, offset, speed in [(3, -60.0, 21.5), (2, -35.0, 20.0), (3, -90.0, 20.0), (2, -90.0, 20.0)]:
+        car = MergingDriver.make_on_lane(env.road, (*FORWARD, lane), env.vehicle.position[0] + offset, speed)
+        env.road.vehicles.append(car)
+    for replaced in ([3], [4], []):
+        expected = replaced if called else []
+        assert traffic.recycle(env.road, env.vehicle, (21.0, 24.0), env.np_random) == expected
+        if called:
+            lanes = [env.road.vehicles[i].lane_index for i in expected]
+            assert all(env.road.vehicles[i].position[0] > env.vehicle.position[0] + traffic.SIGHT for i in expected)
+            assert all(lane[:2] == FORWARD for lane in lanes)
+
+
+def overtakings(scenario: str, u: float) -> tuple[int, float]:
+    """By whom a car that stands on the left-most lane is overtaken in a minute, and how many cars are in sight."""
+    env = BlindEnv(scenario=scenario, vehicles_count=0, max_episode_steps=None)
+    env.reset(seed=0)
+    place(env, RAMP_START + u, 0.0)
+    traffic.populate(env.road, env.vehicle, 20, env.traffic_speed, env.np_random)
+    passed, seen = 0, []
+    for step in range(300):
+        assert env.step(STRAIGHT)[4]["end_reason"] is None
+        before, after = (pose[1:, 0] - RAMP_START - u for pose in (env._poses[0], env._snapshot()))
+        passed += int(((before < 0) & (after >= 0)).sum())
+        if step >= 100:
+            seen.append(((after > 0) & (after < 205)).sum())
+    return passed, float(np.mean(seen))
+
+
+@pytest.mark.parametrize("u", [100.0, 230.0])
+def test_traffic_goes_on_past_a_car_that_stands_where_a_ramp_begins_ahead(u: float) -> None:
+    passed, seen = overtakings("merge", u)
+    as_many, as_seen = overtakings("highway", 0.0)
+    assert as_many > 30 and 0.75 < passed / as_many < 1.25
+    assert as_seen > 5 and 0.7 < seen / as_seen < 1.3
+
+
+def test_who_arrives_on_a_ramp_is_slow() -> None:
+    env = BlindEnv(scenario="merge", vehicles_count=0)
+    arrivals = 0
+    for seed in range(20):
+        env.reset(seed=seed)
+        x = RAMP_START - traffic.SIGHT + 5.0
+        place(env, x, 0.0)
+        env.road.vehicles.append(MergingDriver.make_on_lane(env.road, (*FORWARD, 0), x - 150.0, 20.0))
+        assert traffic.recycle(env.road, env.vehicle, (21.0, 24.0), env.np_random) == [1]
+        newcomer = env.road.vehicles[1]
+        slow, fast = traffic.RAMP_SPEED if newcomer.lane_index == (*FORWARD, 4) else (21.0, 24.0)
+        assert slow <= newcomer.speed == newcomer.target_speed <= fast and 21 <= newcomer.cruise_speed <= 24
+        arrivals += newcomer.lane_index == (*FORWARD, 4)
+    assert 5 <= arrivals <= 15
 
 
 # ---- reward, ends ----
@@ -274,6 +330,43 @@ def test_the_acceleration_lane_is_road_while_it_lasts() -> None:
     assert env.step(STRAIGHT)[4]["offroad"]
 
 
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_episodes_begin_anywhere_but_on_the_plain_highway(scenario: str) -> None:
+    env = BlindEnv(scenario=scenario, vehicles_count=0)
+    starts = []
+    for seed in range(10):
+        env.reset(seed=seed)
+        starts.append(float(env.vehicle.position[0]))
+    if scenario == "highway":
+        assert set(starts) == {START_X}
+    else:
+        assert START_X <= min(starts) < max(starts) - 300 and max(starts) <= START_X + PERIOD
+
+
+@pytest.mark.parametrize("speed", [0.0, 15.0, 30.0])
+def test_no_cars_miss_each_other_head_on(speed: float) -> None:
+    frequency = HEAD_ON_FREQUENCY
+    env = BlindEnv(
+        scenario="curves",
+        vehicles_count=0,
+        initial_speed=speed,
+        simulation_frequency=frequency,
+        policy_frequency=frequency,
+    )
+    nearer = (30 + speed) / frequency  # per step
+    for phase in np.arange(0, 1, 0.05):
+        env.reset(seed=0)
+        lane, x = env.road.network.get_lane((*ONCOMING, 0)), 2.25 * PERIOD  # where the road leads along x
+        place(env, x, lane.position(ROAD_LENGTH - x, 0.0)[1])
+        ahead = 12 + (1 + phase) * nearer
+        other = HeedlessDriver.make_on_lane(env.road, (*ONCOMING, 0), ROAD_LENGTH - x - ahead, 30.0)
+        env.road.vehicles.append(other)
+        end = None
+        while end is None and other.position[0] > x - nearer:
+            end = env.step(STRAIGHT)[4]["end_reason"]
+        assert end == "crash", phase
+
+
 # ---- the gymnasium contract ----
 
 
@@ -328,7 +421,8 @@ def test_other_numbers_of_lanes(scenario: str, lanes: int) -> None:
         ({"scenario": "city"}, "highway, merge, curves; got 'city'"),
         ({"scenario": None}, "highway, merge, curves"),
         ({"scenario": "curves", "lanes_count": 3}, "even.*got 3, choose 2 or 4"),
-        ({"scenario": "curves", "lanes_count": 1}, "even.*got 1, choose 2"),
+        ({"scenario": "curves", "lanes_count": 1}, "even.*got 1, choose 2$"),
+        ({"scenario": "curves", "simulation_frequency": 2, "policy_frequency": 1}, "simulation_frequency.*>= 3.*got 2"),
         ({"scenario": "merge", "lanes_count": 0}, "lanes_count"),
     ],
 )

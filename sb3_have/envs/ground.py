@@ -119,12 +119,13 @@ class GroundView:
         marking.reshape(-1)[centre] = np.minimum(both, 1)
 
     def _add_ramps(self, marking: Array, road: Array, along: Array, across: Array, sin: Array, cos: Array) -> None:
-        """The ramp that began last before each pixel, and the one that begins within its footprint."""
-        since = along % PERIOD
+        """The ramp that began last before each pixel, and its neighbours where the footprint reaches them."""
+        since, half = along % PERIOD, self.long / 2
         self._draw_ramp(marking, road, since, across, sin, cos, slice(None))
-        rows = np.flatnonzero((since + self.long / 2 > PERIOD).any(axis=(0, 2)))
-        if len(rows):
-            self._draw_ramp(marking, road, since - PERIOD, across, sin, cos, slice(rows[0], rows[-1] + 1))
+        for shift, reaches in [(-PERIOD, since + half > PERIOD), (PERIOD, since - half < RAMP_ENDS - PERIOD)]:
+            rows = np.flatnonzero(reaches.any(axis=(0, 2)))
+            if len(rows):
+                self._draw_ramp(marking, road, since + shift, across, sin, cos, slice(rows[0], rows[-1] + 1))
 
     def _draw_ramp(
         self, marking: Array, road: Array, since: Array, across: Array, sin: Array, cos: Array, rows: slice
@@ -136,11 +137,13 @@ class GroundView:
         :param rows: Which to draw.
         """
         marking, road, since, across = marking[:, rows], road[:, rows], since[:, rows], across[:, rows]
-        wide, long, u = self.wide[rows], self.long[rows], np.maximum(since, 0)
+        wide, long = self.wide[rows], self.long[rows]
         covered = _share_between(since, long, 0, RAMP_ENDS)
-        edges, slopes = self.shape.ramp(u), self.shape.ramp_slope(u)
+        start, middle, end = (np.clip(since + share * long, 0, RAMP_ENDS) for share in np.float32((-0.5, 0, 0.5)))
+        length = np.maximum(end - start, np.float32(1e-3))
         beyond: list[Array] = []
-        for sign, edge, slope in zip((1, -1), edges, slopes, strict=True):
+        for sign, *edges in zip((1, -1), *map(self.shape.ramp, (start, middle, end)), strict=True):
+            edge, slope = edges[1], (edges[2] - edges[0]) / length
             span, narrow = _footprint(wide, long, slope, sin, cos)
             outside = sign * (edge - across) * narrow
             beyond.append((outside - SHOULDER_WIDTH) / span)

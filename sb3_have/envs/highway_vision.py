@@ -20,8 +20,9 @@ from sb3_have.envs.road_shape import PERIOD, road_shape
 from sb3_have.envs.vision import VisionSensors, compose
 from sb3_have.envs.weather import weather_choices
 
-MIN_FREQUENCY_HEAD_ON = 2
-"""Least simulation frequency at which cars that meet head-on are seen to collide [Hz]."""
+HEAD_ON_FREQUENCY = 3
+"""Least simulation frequency at which no cars miss each other head-on [Hz]: highway-env looks one step of the one car
+ahead, and the other, at 30 m/s, may come no farther in a step than both cars are long."""
 
 START_X = 1000.0
 """Where the ego vehicle starts along the road [m]: far from the road's own ends."""
@@ -83,7 +84,7 @@ class HighwayVisionEnv(AbstractEnv):
     :param lanes_count: number of lanes in all, not counting ramps; even in "curves"
     :param max_episode_steps: control steps per episode, or None for no limit
     :param initial_speed: of the ego vehicle [m/s], in 0 to ``max_speed``
-    :param simulation_frequency: [Hz], a multiple of ``policy_frequency``, and 2 or more in "curves"
+    :param simulation_frequency: [Hz], a multiple of ``policy_frequency``, and 3 or more in "curves"
     :param policy_frequency: control steps per second [Hz]
     :param steering_range: steering angle at full lock [rad]
     :param max_speed: top speed [m/s]; the car does not reverse
@@ -138,9 +139,9 @@ class HighwayVisionEnv(AbstractEnv):
                 f"simulation_frequency ({simulation_frequency} Hz) must be a multiple of "
                 f"policy_frequency ({policy_frequency} Hz), or control steps would lose time"
             )
-        if scenario == "curves" and simulation_frequency < MIN_FREQUENCY_HEAD_ON:
+        if scenario == "curves" and simulation_frequency < HEAD_ON_FREQUENCY:
             raise ValueError(
-                f"simulation_frequency must be >= {MIN_FREQUENCY_HEAD_ON} Hz in scenario 'curves', or cars would pass "
+                f"simulation_frequency must be >= {HEAD_ON_FREQUENCY} Hz in scenario 'curves', or cars would pass "
                 f"through each other head-on; got {simulation_frequency!r}"
             )
         for name, positive in [("max_speed", max_speed), ("steering_range", steering_range)]:
