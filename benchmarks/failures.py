@@ -3,8 +3,9 @@
     python -m sb3_have.demo                                              # trains a model, or take one of your own
     python -m benchmarks.failures runs/demo/havesac_demo.zip --config havesac
 
-Every modality fails in every way that it can, at one severity; the episodes are the same for all, drawn from all
-weathers. Each row is appended to the CSV file as it is made; the same command goes on where it was stopped. Columns:
+Each of rgb, event and depth fails in every way that it can, at one severity, on top of the configuration's own
+``env_wrapper``; the episodes are the same for all, drawn from all weathers. Each row is appended to the CSV file as it
+is made; the same command goes on where it was stopped. Columns:
 ``modality, kind, severity`` ("none" for the healthy car), ``distance_mean``, ``distance_std`` [m] and ``return_mean``
 over the ``episodes``, ``kept``: the distance over the healthy one, ``crash_share`` and ``offroad_share``.
 """
@@ -12,7 +13,7 @@ over the ``episodes``, ``kept``: the distance over the healthy one, ``crash_shar
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,35 +25,52 @@ from gymnasium import spaces
 from benchmarks.measure import RESULTS, machine
 from sb3_have import HAVESAC
 from sb3_have.common.evaluation import evaluate_episodes
-from sb3_have.configuration import evaluation_env_kwargs, load_config
+from sb3_have.configuration import Env, env_wrapper, evaluation_env_kwargs, load_config
 from sb3_have.envs.weather import WEATHERS
-from sb3_have.sensors import SensorFailure, failures_for
+from sb3_have.sensors import SENSORS, SensorFailure, failures_for
 
 NONE = ("none", "none", 0)
 Case = tuple[str, str, int]
 
 
 def cases(space: spaces.Space[Any], severity: int) -> Iterator[Case]:
-    """The healthy car, then every modality in its own order with every kind of failure it knows."""
+    """The healthy car, then every modality called rgb, event or depth with every kind of failure it knows."""
     assert isinstance(space, spaces.Dict)
     yield NONE
     for modality in space.spaces:
-        for kind in failures_for(modality):
-            yield modality, kind, severity
+        if modality in SENSORS:
+            for kind in failures_for(modality):
+                yield modality, kind, severity
 
 
-def drive(model: Any, env_id: str, case: Case, n_episodes: int, seed: int, **kwargs: Any) -> dict[str, Any]:
+def wrapped(env: Env, inner: Callable[[Env], Env] | None, case: Case) -> Env:
+    """The environment of the training with a failure on top."""
+    env = env if inner is None else inner(env)
+    modality, kind, severity = case
+    return env if case == NONE else SensorFailure(env, modality, kind, severity)
+
+
+def drive(
+    model: Any,
+    env_id: str,
+    case: Case,
+    n_episodes: int,
+    seed: int,
+    inner: Callable[[Env], Env] | None = None,
+    **kwargs: Any,
+) -> dict[str, Any]:
     """One row of the table.
 
     :param model: trained on ``env_id``
     :param case: modality, kind and severity
     :param n_episodes: in each weather
     :param seed: of the episodes
+    :param inner: wrapper of the training, see :func:`~sb3_have.configuration.env_wrapper`
     :param kwargs: further ones of :func:`~sb3_have.common.evaluation.evaluate_episodes`
     """
     modality, kind, severity = case
-    failure = None if case == NONE else partial(SensorFailure, modality=modality, kind=kind, severity=severity)
-    episodes = evaluate_episodes(model, env_id, WEATHERS, n_episodes, seed, env_wrapper=failure, **kwargs)
+    wrapper = partial(wrapped, inner=inner, case=case)
+    episodes = evaluate_episodes(model, env_id, WEATHERS, n_episodes, seed, env_wrapper=wrapper, **kwargs)
     return {
         "modality": modality,
         "kind": kind,
@@ -79,9 +97,10 @@ def main(arguments: list[str] | None = None) -> None:
 
     th.set_num_threads(1)
     model = HAVESAC.load(args.model, device="cpu")
-    env_kwargs = evaluation_env_kwargs(load_config(args.config, args.env))
-    of_run = {"model": args.model.name, "training_steps": model.num_timesteps, "seed": args.seed}
-    of_run |= {"episodes": args.episodes * len(WEATHERS)}
+    config = load_config(args.config, args.env)
+    kwargs: dict[str, Any] = {"env_kwargs": evaluation_env_kwargs(config), "n_envs": args.envs}
+    of_run = {"model": str(args.model), "training_seed": model.seed, "training_steps": model.num_timesteps}
+    of_run |= {"config": args.config, "env": args.env, "seed": args.seed, "episodes": args.episodes * len(WEATHERS)}
     done = pd.DataFrame(columns=["modality", "kind", "severity", *of_run])
     if args.out.exists():
         done = pd.read_csv(args.out, keep_default_na=False)
@@ -91,7 +110,7 @@ def main(arguments: list[str] | None = None) -> None:
     for case in cases(model.observation_space, args.severity):
         if case in finished:
             continue
-        row = drive(model, args.env, case, args.episodes, args.seed, env_kwargs=env_kwargs, n_envs=args.envs)
+        row = drive(model, args.env, case, args.episodes, args.seed, env_wrapper(config), **kwargs)
         healthy = row if case == NONE else done[done["kind"] == "none"].iloc[0]
         row["kept"] = row["distance_mean"] / healthy["distance_mean"]
         row |= of_run | machine()

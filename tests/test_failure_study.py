@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 from envs import TINY
 from fake_drive import ENV_ID, FakeDrive
 
@@ -14,9 +15,13 @@ from sb3_have.sensors import failures_for
 
 
 def test_every_failure_has_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    model = HAVESAC("MultiInputPolicy", FakeDrive(), buffer_size=10, policy_kwargs=TINY, device="cpu")
+    model = HAVESAC("MultiInputPolicy", FakeDrive(), buffer_size=10, policy_kwargs=TINY, device="cpu", seed=0)
     model.save(tmp_path / "model.zip")
-    (tmp_path / "mine.yml").write_text(f'"{ENV_ID}":\n  env_kwargs: {{weather: slow}}\n')
+    config = {
+        "env_kwargs": {"weather": "slow"},
+        "env_wrapper": {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 3}},
+    }
+    (tmp_path / "mine.yml").write_text(yaml.safe_dump({ENV_ID: config}))
     monkeypatch.setattr(failures, "WEATHERS", ("slow", "fast"))
     command = [str(tmp_path / "model.zip"), "--config", str(tmp_path / "mine.yml"), "--env", ENV_ID]
     command += ["--episodes", "1", "--envs", "1", "--out", str(tmp_path / "failures.csv")]
@@ -41,7 +46,8 @@ def test_every_failure_has_a_row(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert len(calls) == len(expected) + 1, "what was finished is not driven again"
     # Failures do not change what this environment does, only what is seen of it.
     assert (table["episodes"] == 2).all() and (table["distance_mean"] == table["distance_mean"][0]).all()
-    assert (table["kept"] == 1).all() and (table["training_steps"] == 0).all()
+    assert (table["distance_mean"] == (3 + 6) / 2).all(), "three steps of 1 and 2 m, by the configuration's env_wrapper"
+    assert (table["kept"] == 1).all() and (table["training_steps"] == 0).all() and (table["training_seed"] == 0).all()
     with pytest.raises(SystemExit, match="another run"):
         failures.main([*command, "--seed", "1"])
 

@@ -61,8 +61,8 @@ def evaluate(
     :param n_envs: environments at a time, each in a process of its own when there are several
     :param deterministic: whether the policy's mode is driven rather than a sample of it
     :param progress_bar: shown per episode
-    :param env_wrapper: applied to every environment, e.g. ``partial(SensorFailure, modality="rgb", kind="black")``; a
-        function or class that can be pickled if there are several environments
+    :param env_wrapper: applied to every environment, e.g. ``partial(SensorFailure, modality="rgb", kind="black",
+        severity=3)``; a function or class that can be pickled if there are several environments
     :return: a row per weather: ``weather, episodes, return_mean, return_std, distance_mean, distance_std`` [m],
         ``steps_mean, crash_share, offroad_share`` (0..1). Standard deviations are over episodes (ddof=0, as SB3's);
         what the environment's ``info`` does not tell (``distance, crashed, offroad``) is NaN
