@@ -139,7 +139,7 @@ class GroundView:
         marking, road, since, across = marking[:, rows], road[:, rows], since[:, rows], across[:, rows]
         wide, long = self.wide[rows], self.long[rows]
         covered = _share_between(since, long, 0, RAMP_ENDS)
-        start, middle, end = (np.clip(since + share * long, 0, RAMP_ENDS) for share in np.float32((-0.5, 0, 0.5)))
+        start, middle, end = (np.clip(x, 0, RAMP_ENDS) for x in (since - long / 2, since, since + long / 2))
         length = np.maximum(end - start, np.float32(1e-3))
         beyond: list[Array] = []
         for sign, *edges in zip((1, -1), *map(self.shape.ramp, (start, middle, end)), strict=True):
@@ -165,7 +165,8 @@ def _footprint(wide: Array, long: Array, slope: Array, sin: Array, cos: Array) -
 
 def _share_between(x: Array, length: Array, first: float, last: float) -> Array:
     """Share of a footprint of this length, its middle at x, that lies between two places farther apart than that."""
-    return np.clip(np.minimum(x - np.float32(first), np.float32(last) - x) / length + np.float32(0.5), 0, 1)
+    inside = np.minimum(x - np.float32(first), np.float32(last) - x)
+    return np.asarray(np.clip(inside / length + np.float32(0.5), 0, 1))
 
 
 def _line_share(distance: Array, span: Array) -> NDArray[np.float32]:

@@ -171,7 +171,7 @@ class Roadside:
         if not self.shape.ramps:
             return np.zeros(points.shape[:-1])
         rail = self.shape.middle + self.shape.half_width + RAIL_SETBACK
-        return np.clip((points[..., 1] - rail) / self.shape.lane_width, 0, 1)
+        return np.asarray(np.clip((points[..., 1] - rail) / self.shape.lane_width, 0, 1))
 
     def _trees(self, x: Array) -> Faces:
         # Every instant has the faces around its own x, so that it looks the same whichever others are rendered with it.
