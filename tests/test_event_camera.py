@@ -286,14 +286,23 @@ def test_first_frame_after_reset_is_silent() -> None:
     "kwargs",
     [
         {"height": 0},
+        {"height": 65536},
+        {"height": 2.0},
+        {"width": 2.0},
         {"threshold": 0.0},
         {"threshold": (0.2, -0.1)},
+        {"threshold": float("inf")},
+        {"threshold": (0.2, float("nan"))},
+        {"threshold": (0.1, 0.2, 0.3)},
+        {"threshold": "x"},
         {"threshold_sigma": -1.0},
         {"refractory": -0.1},
+        {"refractory": "x"},
         {"leak_rate": float("nan")},
         {"shot_rate": -1.0},
         {"mapping": "sqrt"},
         {"log_eps": 0.0},
+        {"log_eps": float("inf")},
         {"cutoff_hz": 0.0},
         {"cutoff_intensity": 1.0},
         {"cutoff_intensity": -1.0, "cutoff_hz": 30.0},
@@ -303,6 +312,13 @@ def test_first_frame_after_reset_is_silent() -> None:
 def test_bad_parameters(kwargs: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=next(iter(kwargs))):
         EventCamera(**{"height": 4, "width": 4, **kwargs})
+
+
+def test_numbers_of_numpy_are_parameters() -> None:
+    plain = EventCamera(6, 5, (0.25, 0.5), refractory=0, log_eps=1)
+    numpy = EventCamera(np.int64(6), np.uint8(5), [np.float32(0.25), 0.5], refractory=np.int32(0), log_eps=np.int8(1))  # type: ignore[arg-type]
+    np.testing.assert_array_equal(numpy.thresholds, plain.thresholds)
+    np.testing.assert_array_equal(run(numpy, np.exp(film())), run(plain, np.exp(film())))
 
 
 def test_bad_frames_are_refused_and_leave_no_trace() -> None:

@@ -328,6 +328,7 @@ def bar(**kwargs: Any) -> Env:
         (lambda: bar(representation="image"), ValueError, "voxel"),
         (lambda: bar(bins=0), ValueError, "bins"),
         (lambda: bar(bins=2.5), ValueError, "bins must be a whole number, got 2.5"),
+        (lambda: bar(bins=True), ValueError, "bins must be a whole number, got True"),
         (lambda: bar(tau=-1.0, representation="time_surface"), ValueError, "tau"),
         (lambda: bar(image_size=-3), ValueError, "image_size"),
         (lambda: bar(dt=0.0), ValueError, "dt must be.*got 0.0"),

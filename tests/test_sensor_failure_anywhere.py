@@ -160,6 +160,8 @@ ODD = spaces.Dict(
         (ODD, ("dim", "black"), {}, r"'dim'.*0..100"),
         (ODD, ("ints", "black"), {}, r"'ints'.*float vector.*uint8 \(6,\)"),
         (ODD, ("n", "black"), {}, r"'n' must be a Box.*Discrete"),
+        (SPACE, (["rgb"], "black"), {}, r"modality must be a string or None, got \['rgb'\]"),
+        (SPACE, ("rgb", "black"), {"name": 3}, r"name must be a string or None, got 3"),
         (SPACE, ("rgb", "black"), {"severity": 4}, r"severity.*4"),
         (SPACE, ("rgb", "black"), {"severity": 0}, r"severity.*0"),
         (SPACE, ("rgb", "black"), {"probability": 0.5, "schedule": (0, 2)}, r"either probability or schedule"),

@@ -251,6 +251,8 @@ def test_channel_last_images() -> None:
     np.testing.assert_array_equal(named.reset()[0]["grey"], seen["grey"][..., None])
     np.testing.assert_array_equal(named.reset()[0]["first"], seen["first"])
 
+    alone = ChannelLastImages(Images(inner["grey"], seen["grey"]), ["state"])
+    np.testing.assert_array_equal(alone.reset()[0], seen["grey"][..., None])
     alone = ChannelLastImages(Images(inner["unit"], seen["unit"]))
     assert alone.observation_space == spaces.Box(0, 255, (8, 9, 3), np.uint8)
     np.testing.assert_array_equal(alone.reset()[0], out["unit"])
@@ -280,12 +282,12 @@ def test_channel_last_images() -> None:
         (lambda: ChannelLastImages(MovingBar(observation="dict"), 5), ValueError, "list of keys, got 5"),  # type: ignore[arg-type]
         (lambda: RenderObservation(MovingBar("rgb_array"), 5), ValueError, "key must be a string, got 5"),  # type: ignore[arg-type]
         (lambda: RenderObservation(MovingBar("rgb_array"), image_size=True), ValueError, "image_size.*True"),
-        (lambda: DictObservation(MovingBar(observation="dict")), ValueError, "Dict already.*lidar"),
+        (lambda: DictObservation(MovingBar(observation="dict")), ValueError, "Dict already.*lidar.*SelectModalities"),
         (lambda: SelectModalities(MovingBar(), ["rgb"]), ValueError, "DictObservation first"),
         (lambda: SelectModalities(MovingBar(observation="dict"), ["rgb"]), KeyError, "no key 'rgb', only.*lidar"),
         (lambda: SelectModalities(MovingBar(observation="dict"), "grey"), ValueError, "list of keys, got 'grey'"),
         (lambda: SelectModalities(MovingBar(observation="dict"), []), ValueError, "non-empty"),
-        (lambda: ChannelLastImages(MovingBar()), ValueError, r"no image of three sizes.*Box"),
+        (lambda: ChannelLastImages(MovingBar()), ValueError, r"no image of three sizes.*Box.*keys=\["),
         (lambda: ChannelLastImages(MovingBar(observation="dict"), ["rgb"]), KeyError, "no key 'rgb', only.*lidar"),
         (lambda: ChannelLastImages(MovingBar(observation="dict"), "grey"), ValueError, "list of keys, got 'grey'"),
         (

@@ -7,6 +7,8 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sb3_have.sensors.checks import is_finite
+
 DepthEncoding = Literal["log", "clipped", "inverse"]
 
 #: Farthest distance of the logarithmic form in metres and its range in log units, as CARLA's logarithmic depth has
@@ -146,7 +148,7 @@ def disparity_noise(
 def _range(encoding: str, maximum: float) -> tuple[float, float]:
     if encoding not in get_args(DepthEncoding):
         raise ValueError(f"depth encoding must be one of {get_args(DepthEncoding)}, got {encoding!r}")
-    if not INVERSE_NEAR < maximum < np.inf:
+    if not is_finite(maximum) or maximum <= INVERSE_NEAR:
         raise ValueError(f"the maximum depth must be finite and above {INVERSE_NEAR} m, got {maximum!r}")
     return {"log": (LOG_FAR * float(np.exp(-LOG_RANGE)), LOG_FAR), "clipped": (0.0, maximum)}.get(
         encoding, (INVERSE_NEAR, maximum)

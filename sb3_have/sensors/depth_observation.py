@@ -13,6 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from sb3_have.sensors.checks import describe, is_number, parse_size, pick
 from sb3_have.sensors.depth import DepthEncoding, depth_from_zbuffer, disparity_noise, encode_depth
 from sb3_have.sensors.rendering import (
     DEPTH_MODES,
@@ -20,10 +21,6 @@ from sb3_have.sensors.rendering import (
     Observation,
     SensorWrapper,
     check_render_mode,
-    describe,
-    is_number,
-    parse_size,
-    pick,
 )
 
 #: Share of the far plane from which on a MuJoCo scene with a skybox shows its wall; edges blur it below 0.7.

@@ -19,6 +19,8 @@ from typing import Any, Final, Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sb3_have.sensors.checks import check_whole, is_finite, positive_pair
+
 Mapping = Literal["log", "lin_log", "identity"]
 
 #: One event: column, row, time in seconds, polarity +1 (brighter) or -1 (darker). Environments count in seconds, and in
@@ -103,29 +105,25 @@ class EventCamera:
         cutoff_intensity: float | None = None,
         seed: int | None = None,
     ) -> None:
-        if height < 1 or width < 1 or max(height, width) > np.iinfo(np.uint16).max:
-            raise ValueError(f"height and width must lie in 1..65535, got {height} and {width}")
-        nominal = np.array(
-            threshold if isinstance(threshold, (tuple, list)) else (threshold, threshold), dtype=np.float64
-        )
-        if nominal.shape != (2,) or not np.all(nominal > 0):
-            raise ValueError(f"threshold must be one positive number or a pair (positive, negative), got {threshold!r}")
+        check_whole("height", height, 1, np.iinfo(np.uint16).max)
+        check_whole("width", width, 1, np.iinfo(np.uint16).max)
+        nominal = np.array(positive_pair("threshold", threshold))
         for name, value in (
             ("threshold_sigma", threshold_sigma),
             ("refractory", refractory),
             ("leak_rate", leak_rate),
             ("shot_rate", shot_rate),
         ):
-            if not 0 <= value < np.inf:
+            if not is_finite(value) or value < 0:
                 raise ValueError(f"{name} must be a finite number >= 0, got {value!r}")
         if mapping not in get_args(Mapping):
             raise ValueError(f"mapping must be one of {get_args(Mapping)}, got {mapping!r}")
-        if mapping == "log" and not log_eps > 0:
-            raise ValueError(f"log_eps must be > 0, got {log_eps!r}")
-        if cutoff_hz is not None and not 0 < cutoff_hz < np.inf:
+        if mapping == "log" and not (is_finite(log_eps) and log_eps > 0):
+            raise ValueError(f"log_eps must be a finite number > 0, got {log_eps!r}")
+        if cutoff_hz is not None and not (is_finite(cutoff_hz) and cutoff_hz > 0):
             raise ValueError(f"cutoff_hz must be a finite number > 0, or None for no filter, got {cutoff_hz!r}")
         if cutoff_intensity is not None and (
-            cutoff_hz is None or mapping == "identity" or not 0 < cutoff_intensity < np.inf
+            cutoff_hz is None or mapping == "identity" or not is_finite(cutoff_intensity) or cutoff_intensity <= 0
         ):
             raise ValueError(
                 f"cutoff_intensity must be a finite number > 0, got {cutoff_intensity!r}, and needs a cutoff_hz and a "

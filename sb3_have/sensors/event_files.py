@@ -300,8 +300,9 @@ def read_events(
     """
     The events of a recording with start <= t < end, in seconds from its start; only they are read.
 
-    Parameters, return and errors as :class:`EventFile` and :meth:`EventFile.read`. The times leave out
-    :attr:`EventFile.t_offset`.
+    ``path`` and ``group`` are those of :class:`EventFile`; ``start``, ``end`` and the return those of
+    :meth:`EventFile.read`; the errors those of both. The times leave out :attr:`EventFile.t_offset`. Only a size
+    that the file itself states bounds the coordinates; :class:`EventFile` can be told one.
     """
     with EventFile(path, group) as file:
         return file.read(start, end)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import inspect
 from collections.abc import Callable, Mapping, Sequence
+from numbers import Integral
 from typing import Any, Final
 
 import cv2
@@ -13,6 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from sb3_have.sensors.checks import describe, is_number, parse_size, pick
 from sb3_have.sensors.event_camera import EventCamera
 from sb3_have.sensors.rendering import (
     COLOUR_MODES,
@@ -21,11 +23,7 @@ from sb3_have.sensors.rendering import (
     Observation,
     SensorWrapper,
     check_render_mode,
-    describe,
     is_highway_env,
-    is_number,
-    parse_size,
-    pick,
     step_duration,
 )
 from sb3_have.sensors.representations import EVENT_ZERO, Representation, channels, encode_events, represent
@@ -84,7 +82,8 @@ class EventObservation(SensorWrapper):
     :param dt: Seconds that a step takes; in the render modes ``..._list``, seconds between two frames of the list. None
         asks the environment (:func:`~sb3_have.sensors.rendering.step_duration`). With an action repeat between the
         environment and this wrapper, and no list, give the time of all the repetitions.
-    :param tau: Time constant of a time surface in seconds; None is one step.
+    :param tau: Time constant of a time surface in seconds; None is one step. Whatever it is, the surface holds the
+        events of the current step only.
     :raises ValueError: on a wrong render mode, an observation that is not such an image, an unknown option, a key that
         exists already, a source whose size changes, or if the environment does not say how long a step takes.
     :raises KeyError: if the observation has no key ``source``.
@@ -118,7 +117,7 @@ class EventObservation(SensorWrapper):
         )
         SensorWrapper.__init__(self, env, key)
         self.source, self.bins, self.representation, self.tau = source, bins, representation, tau
-        if not isinstance(bins, (int, np.integer)):
+        if not is_number(bins, Integral):
             raise ValueError(f"bins must be a whole number, got {bins!r}")
         if dt is not None and not (is_number(dt) and 0 < dt < np.inf):
             raise ValueError(f"dt must be a finite number of seconds > 0, got {dt!r}")

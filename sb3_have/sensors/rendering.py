@@ -9,16 +9,17 @@ from __future__ import annotations
 
 import copy
 import zlib
-from collections.abc import Callable, Mapping, Sequence
-from numbers import Integral, Real
+from collections.abc import Callable, Sequence
 from types import TracebackType
-from typing import Any, NamedTuple, TypeGuard
+from typing import Any, NamedTuple
 
 import cv2
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
+
+from sb3_have.sensors.checks import describe, is_number, parse_size
 
 Array = NDArray[Any]
 Observation = dict[str, Any]
@@ -236,7 +237,8 @@ def step_duration(env: gym.Env[Any, Any]) -> float | None:
     """
     if is_highway_env(env):
         return 1 / float(env.unwrapped.config["policy_frequency"])  # type: ignore[attr-defined]
-    dt, rate = getattr(env.unwrapped, "dt", None), env.metadata.get("render_fps")
+    dt: Any = getattr(env.unwrapped, "dt", None)
+    rate = env.metadata.get("render_fps")
     if is_number(dt) and 0 < dt < np.inf:
         return float(dt)
     return 1 / float(rate) if rate else None
@@ -286,41 +288,8 @@ def sort_frames(mode: str | None, rendered: Any) -> Frames:
     return frames
 
 
-def describe(value: Any) -> str:
-    """Dtype and shape of an array, the type of anything else."""
-    return f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
-
-
-def is_number(value: Any, kind: type = Real) -> TypeGuard[float]:
-    """Whether this is one number of Python or numpy, a whole one with ``kind=Integral``; a bool is not."""
-    return isinstance(value, kind) and not isinstance(value, bool)
-
-
-def parse_size(image_size: int | Sequence[int] | None) -> tuple[int, int] | None:
-    """
-    (rows, columns) of one number or a pair.
-
-    :raises ValueError: unless these are whole numbers of at least 1.
-    """
-    if image_size is None:
-        return None
-    size = tuple(image_size) if isinstance(image_size, Sequence) else (image_size, image_size)
-    if len(size) != 2 or not all(is_number(side, Integral) and int(side) > 0 for side in size):
-        raise ValueError(f"image_size must be a whole number or a pair (rows, columns), got {image_size!r}")
-    return int(size[0]), int(size[1])
-
-
 def resize(image: Array, size: tuple[int, int], interpolation: int = cv2.INTER_AREA) -> Array:
     """The image with this many (rows, columns); the channels stay."""
     if image.shape[:2] == size:
         return image
     return cv2.resize(np.ascontiguousarray(image), size[::-1], interpolation=interpolation)
-
-
-def pick(available: Mapping[str, Any], key: str, wrapper: str) -> Any:
-    """
-    :raises KeyError: if there is no such key; lists those there are.
-    """
-    if key not in available:
-        raise KeyError(f"{wrapper}: the observation has no key {key!r}, only {list(available)}; name one of them")
-    return available[key]

@@ -7,6 +7,8 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from sb3_have.sensors.checks import is_finite
+
 Representation = Literal["sbt", "voxel", "count", "polarity", "time_surface"]
 
 #: The code of "no event" in an 8-bit event image. Code 0 never occurs in data: it says that there is no data.
@@ -135,7 +137,8 @@ def represent(
     :param representation: ``"sbt"`` (:func:`stack_by_time`), ``"voxel"`` (:func:`voxel_grid`), ``"count"``
         (:func:`count_frames`), ``"polarity"`` (:func:`polarity_counts`) or ``"time_surface"`` (:func:`time_surface`).
     :param tau: Time constant of ``"time_surface"`` in seconds; by default the length of the window, so that all of its
-        events lie between 1/e and 1.
+        events lie between 1/e and 1. Whatever it is, events before t0 are left out: images of one step after the other
+        hold the events of their own step only.
     :return: (height, width, C) with C as :func:`channels` has it.
     """
     depth = channels(representation, bins)
@@ -168,7 +171,7 @@ def represent(
 def _time_surface(
     index: NDArray[np.int64], times: NDArray[np.float64], now: float, tau: float, height: int, width: int
 ) -> NDArray[np.float64]:
-    if not 0 < tau < np.inf:
+    if not is_finite(tau) or tau <= 0:
         raise ValueError(f"tau must be a finite number of seconds > 0, got {tau!r}")
     last = np.full(height * width * 2, -np.inf)
     np.maximum.at(last, index, times)

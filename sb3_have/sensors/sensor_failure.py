@@ -6,7 +6,7 @@ import re
 import zlib
 from collections import deque
 from collections.abc import Callable, Sequence
-from numbers import Integral, Real
+from numbers import Integral
 from typing import Any, Literal, get_args
 
 import gymnasium as gym
@@ -14,8 +14,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from sb3_have.sensors.checks import describe, is_number
 from sb3_have.sensors.failures import FAILURES, SENSORS, UNSIGNED, failures_for
-from sb3_have.sensors.rendering import describe
 
 Array = NDArray[Any]
 Interval = tuple[int, "int | None"]
@@ -109,6 +109,9 @@ class SensorFailure(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
             _disable_deepcopy=True,  # a function need not be copyable
         )  # fmt: skip
         gym.Wrapper.__init__(self, env)
+        for option, given in (("modality", modality), ("name", name)):
+            if given is not None and not isinstance(given, str):
+                raise ValueError(f"{option} must be a string or None, got {given!r}")
         space = _modality_space(env.observation_space, modality)
         self.modality = modality
         self.kind = kind
@@ -119,9 +122,9 @@ class SensorFailure(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
                 f"kind {kind!r} is no failure of a sensor {self.sensor!r}; its kinds are "
                 f"{', '.join(failures_for(self.sensor))} (another sort of sensor: give sensor=...)"
             )
-        if not _is(Integral, severity) or severity not in (1, 2, 3):
+        if not is_number(severity, Integral) or severity not in (1, 2, 3):
             raise ValueError(f"severity must be 1, 2 or 3, got {severity!r}")
-        if not _is(Integral, seed) or seed < 0:
+        if not is_number(seed, Integral) or seed < 0:
             raise ValueError(f"seed must be an integer >= 0, got {seed!r}")
         if not isinstance(signed, bool) or not (signed or self.sensor == "event"):
             raise ValueError(f"signed must be True, or False for a sensor 'event', got {signed!r} for {self.sensor!r}")
@@ -130,7 +133,7 @@ class SensorFailure(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
 
         if probability is not None and schedule is not None:
             raise ValueError("give either probability or schedule, not both")
-        if probability is not None and not (_is(Real, probability) and 0 <= probability <= 1):
+        if probability is not None and not (is_number(probability) and 0 <= probability <= 1):
             raise ValueError(f"probability must be a number in 0..1, got {probability!r}")
         self.probability = 1.0 if probability is None else float(probability)
         if per not in get_args(Per):
@@ -228,7 +231,7 @@ class SensorFailure(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         if not self.probability < 1:
             raise ValueError("a probability of 1 fails all the time; leave duration out or lower the probability")
         least = max(1.0, self.probability / (1 - self.probability))
-        if not (_is(Real, duration) and least <= duration < np.inf):
+        if not (is_number(duration) and least <= duration < np.inf):
             raise ValueError(
                 f"with probability={self.probability} failures last {least:g} steps or more on average, "
                 f"got duration={duration!r}"
@@ -304,14 +307,9 @@ def _checked_schedule(schedule: Schedule | None) -> tuple[Interval, ...] | Calla
 
 
 def _is_interval(pair: Sequence[Any]) -> bool:
-    if len(pair) != 2 or not _is(Integral, pair[0]) or pair[0] < 0:
+    if len(pair) != 2 or not is_number(pair[0], Integral) or pair[0] < 0:
         return False
-    return pair[1] is None or (_is(Integral, pair[1]) and bool(pair[1] > pair[0]))
-
-
-def _is(kind: type, value: Any) -> bool:
-    """Whether this is such a number; a bool is none."""
-    return isinstance(value, kind) and not isinstance(value, bool)
+    return pair[1] is None or (is_number(pair[1], Integral) and bool(pair[1] > pair[0]))
 
 
 def _within(intervals: Sequence[Interval], step: int) -> bool:

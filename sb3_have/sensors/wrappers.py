@@ -10,7 +10,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from sb3_have.sensors.rendering import STATE, Array, Observation, describe, pick
+from sb3_have.sensors.checks import describe, pick
+from sb3_have.sensors.rendering import STATE, Array, Observation
 
 
 class DictObservation(gym.ObservationWrapper[Observation, Any, Any], gym.utils.RecordConstructorArgs):
@@ -29,7 +30,8 @@ class DictObservation(gym.ObservationWrapper[Observation, Any, Any], gym.utils.R
             raise ValueError(f"DictObservation: key must be a string, got {key!r}")
         if isinstance(env.observation_space, spaces.Dict):
             raise ValueError(
-                f"DictObservation: the observation is a Dict already, with keys {list(env.observation_space.spaces)}"
+                f"DictObservation: the observation is a Dict already, with keys {list(env.observation_space.spaces)}; "
+                "leave DictObservation out, or keep some of them with SelectModalities"
             )
         self.key = key
         self.observation_space = spaces.Dict({key: env.observation_space})
@@ -73,8 +75,8 @@ class ChannelLastImages(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordC
     The channels are the smallest of the three sizes; between equal ones, the last.
 
     :param env: Environment with a Dict observation, or with one image.
-    :param keys: Keys of the images. None takes every Box of three sizes with bounds 0..1 or 0..255; grey (H, W) images
-        must be named.
+    :param keys: Keys of the images; the key of an observation that is itself an image is ``"state"``. None takes every
+        Box of three sizes with bounds 0..1 or 0..255; grey (H, W) images must be named.
     :raises ValueError: if a named key is no image, if there is none, or on an image that is not of its space: its
         shape, its kind of number, or its bounds.
     :raises KeyError: if a key is missing.
@@ -91,7 +93,10 @@ class ChannelLastImages(gym.ObservationWrapper[Any, Any, Any], gym.utils.RecordC
         else:
             keys = [key for key, part in inner.items() if image_fault(part) is None and len(part.shape or ()) == 3]
             if not keys:
-                raise ValueError(f"ChannelLastImages: no image of three sizes with bounds 0..1 or 0..255 among {inner}")
+                raise ValueError(
+                    f"ChannelLastImages: no image of three sizes with bounds 0..1 or 0..255 among {inner}; "
+                    "name grey images: keys=[...]"
+                )
         for key in keys:
             fault = image_fault(pick(inner, key, "ChannelLastImages"))
             if fault is not None:
