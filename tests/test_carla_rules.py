@@ -67,11 +67,13 @@ def test_weights_of_the_reward() -> None:
     ("options", "message"),
     [
         ({"form": "sparse"}, "reward must be one of"),
-        ({"steer_cost": -0.1}, "steer_cost must be >= 0"),
-        ({"brake_cost": math.nan}, "brake_cost must be >= 0"),
-        ({"collision_cost": -1.0}, "collision_cost must be >= 0"),
-        ({"crash_penalty": math.inf}, "crash_penalty must be >= 0"),
-        ({"max_speed": 0.0}, "max_speed must be positive"),
+        ({"steer_cost": -0.1}, "steer_cost must be a number >= 0"),
+        ({"steer_cost": "x"}, "steer_cost must be a number >= 0 .*'x'"),
+        ({"brake_cost": math.nan}, "brake_cost must be a number >= 0"),
+        ({"collision_cost": -1.0}, "collision_cost must be a number >= 0"),
+        ({"crash_penalty": math.inf}, "crash_penalty must be a number >= 0"),
+        ({"max_speed": 0.0}, "max_speed must be a positive number"),
+        ({"max_speed": "x"}, "max_speed must be a positive number, got 'x'"),
     ],
 )
 def test_rewards_that_make_no_sense(options: dict[str, Any], message: str) -> None:
@@ -194,15 +196,22 @@ def test_options_that_say_nothing_are_taken_from_highway_vision() -> None:
         ({"event": {"seed": 1}}, "seed=1 means nothing"),
         ({"event": {"cutoff_hz": 100.0}}, "cutoff_hz=100.0 means nothing"),
         ({"event": {"thresold": 0.3}}, r"unknown event option \['thresold'\]"),
-        ({"event": {"threshold": 0.0}}, "event threshold must be positive"),
-        ({"event": {"threshold": (0.3, -0.3)}}, "event threshold must be positive"),
-        ({"event": {"refractory": -1.0}}, "event refractory must be >= 0"),
+        ({"event": {"threshold": 0.0}}, "event threshold must be one positive number"),
+        ({"event": {"threshold": (0.3, -0.3)}}, "event threshold must be one positive number"),
+        ({"event": {"threshold": (0.1, 0.2, 0.3)}}, r"event threshold must be .* a pair .*got \(0.1, 0.2, 0.3\)"),
+        ({"event": {"threshold": "x"}}, "event threshold must be .*got 'x'"),
+        ({"event": {"refractory": -1.0}}, "event refractory must be a number >= 0"),
+        ({"event": {"refractory": "x"}}, "event refractory must be a number >= 0, got 'x'"),
+        ({"event": {"log_eps": 0}}, "event log_eps must be > 0 with mapping 'log'"),
+        ({"event": {"representation": "time_surface", "tau": "x"}}, "tau must be a finite number .*'x'"),
         ({"event": {"mapping": "lin_log"}}, "'log' or 'identity', got 'lin_log'"),
         ({"event": {"representation": "histogram"}}, "representation must be one of"),
-        ({"event": {"bins": 0}}, "bins"),
+        ({"event": {"bins": 0}}, "event bins must be a whole number >= 1, got 0"),
+        ({"event": {"bins": 2.5}}, "event bins must be a whole number >= 1, got 2.5"),
         ({"depth": {"encodings": "log"}}, r"unknown depth option \['encodings'\]"),
         ({"depth": {"encoding": "linear"}}, "depth encoding must be one of"),
         ({"depth": {"max": 50.0}}, "no effect with encoding 'log'"),
+        ({"depth": {"encoding": "clipped", "max": "x"}}, "maximum depth must be finite .*'x'"),
         ({"weather": "Snow"}, "weather must be 'random' or among"),
         ({"modalities": ("rgb", "lidar")}, "modalities must be a non-empty subset"),
         ({"image_size": 8}, "image_size must be a whole number >= 16"),
@@ -212,14 +221,22 @@ def test_options_that_say_nothing_are_taken_from_highway_vision() -> None:
         ({"simulation_frequency": 5}, "simulation_frequency must be a whole number >= 10"),
         ({"policy_frequency": 3}, "must be a multiple of policy_frequency"),
         ({"collision_ticks": 0}, "collision_ticks must be a whole number >= 1"),
-        ({"tm_port": 80}, "tm_port must be a whole number >= 1024"),
-        ({"traffic_speed": (24.0, 21.0)}, "traffic_speed must be None or a range"),
-        ({"initial_speed": 31.0}, r"initial_speed must lie in 0..max_speed"),
-        ({"steering_range": 0.0}, "steering_range must be positive"),
-        ({"standstill_time": -1.0}, "standstill_time must be positive"),
-        ({"timeout": 0.0}, "timeout must be positive"),
+        ({"tm_port": 80}, r"tm_port must be a whole number in 1024\.\.65535"),
+        ({"port": 70000}, r"port must be a whole number in 1\.\.65535, got 70000"),
+        ({"road_id": "x"}, "road_id must be a whole number >= 0, got 'x'"),
+        ({"traffic_speed": (24.0, 21.0)}, "traffic_speed must be None or .*least, greatest"),
+        ({"traffic_speed": (1.0, math.inf)}, "traffic_speed must be None or .*finite"),
+        ({"traffic_speed": ("1", "2")}, "traffic_speed must be None or .*'1', '2'"),
+        ({"initial_speed": 31.0}, r"initial_speed must be a number in 0..max_speed"),
+        ({"initial_speed": "1"}, r"initial_speed must be a number in 0..max_speed .*'1'"),
+        ({"steering_range": 0.0}, "steering_range must be a positive number"),
+        ({"standstill_time": -1.0}, "standstill_time must be a positive number"),
+        ({"standstill_time": "x"}, "standstill_time must be a positive number, got 'x'"),
+        ({"timeout": 0.0}, "timeout must be a positive number"),
+        ({"timeout": None}, "timeout must be a positive number, got None"),
+        ({"event_grace": "x"}, "event_grace must be a number >= 0, got 'x'"),
         ({"reward": "dense"}, "reward must be one of"),
-        ({"crash_penalty": -1.0}, "crash_penalty must be >= 0"),
+        ({"crash_penalty": -1.0}, "crash_penalty must be a number >= 0"),
         ({"render_mode": "human"}, "render_mode must be None or 'rgb_array'"),
         ({"scenario": "merge"}, "no scenario 'merge'; choose another road by `town` and `road_id`"),
     ],
@@ -243,9 +260,30 @@ def test_spaces_are_those_of_highway_vision() -> None:
     assert env.observation_space["event"].shape == (84, 84, 6)  # type: ignore[index]
 
 
+def test_numbers_of_numpy_and_the_ends_of_the_ranges_are_options() -> None:
+    options: dict[str, Any] = {
+        "port": 65535,
+        "road_id": np.int64(0),
+        "initial_speed": np.float32(30),
+        "traffic_speed": np.array([1, 2]),
+        "standstill_time": math.inf,
+        "event": {"bins": np.int64(2), "threshold": np.array([0.1, 0.2])},
+    }
+    CarlaVisionEnv(**options)
+    assert dvs_attributes(event_options({"mapping": "identity", "log_eps": 0}))["log_eps"] == "0.0"
+
+
 def test_the_papers_options_are_options() -> None:
     env = CarlaVisionEnv(**PAPER)
     assert env.observation_space["event"].shape == (128, 128, 5)  # type: ignore[index]
+
+
+def test_the_papers_car_has_no_top_speed() -> None:
+    top = PAPER["max_speed"]
+    assert top > 70  # beyond 250 km/h
+    assert CarlaVisionEnv(**PAPER)._plan.max_speed == top
+    slow, fast = (Reward(PAPER["reward"], max_speed=speed) for speed in (30.0, top))
+    assert slow([40.0], 0.05, -0.5, 0.4, 9.0, True) == fast([40.0], 0.05, -0.5, 0.4, 9.0, True)
 
 
 def test_importing_the_package_needs_no_carla() -> None:

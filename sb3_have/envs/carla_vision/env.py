@@ -16,13 +16,17 @@ from sb3_have.envs.carla_vision.rules import COLLISION_TICKS, STANDSTILL_TIME, P
 from sb3_have.envs.carla_vision.sensors import depth_options, dvs_attributes, event_image, event_options
 from sb3_have.envs.vision import MODALITIES, Observation, compose
 from sb3_have.envs.weather import weather_choices
+from sb3_have.sensors.checks import check_whole, is_finite, is_number, is_pair
 
 if TYPE_CHECKING:
     from sb3_have.envs.carla_vision.episode import Episode
     from sb3_have.envs.carla_vision.session import Session
 
+#: The greatest number of a port.
+PORTS: Final = 65535
 #: Options that make ``CarlaVision-v0`` the environment of the paper's experiments: 20 Hz control, the full lock,
-#: traffic at the traffic manager's own speeds, ends by 20 colliding ticks, standstill or 1,000 steps only.
+#: traffic at the traffic manager's own speeds, ends by 20 colliding ticks, standstill or 1,000 steps only. The paper
+#: has no top speed: ``max_speed`` is beyond what the car reaches, and its reward does not look at it.
 PAPER: Final[Mapping[str, Any]] = MappingProxyType(
     {
         "modalities": ("rgb", "event"),
@@ -30,6 +34,7 @@ PAPER: Final[Mapping[str, Any]] = MappingProxyType(
         "policy_frequency": 20,
         "max_episode_steps": 1000,
         "steering_range": None,
+        "max_speed": 100.0,
         "traffic_speed": None,
         "reward": "paper",
         "offroad_ends": False,
@@ -86,13 +91,15 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
     :param policy_frequency: control steps per second [Hz]
     :param steering_range: angle of the front wheels at full steering [rad]; None for the vehicle's lock, as in the
         paper. More than in HighwayVision-v0 by default: the road bends, and CARLA steers less at speed
-    :param max_speed: the throttle closes at this speed [m/s]; the car does not reverse
+    :param max_speed: the throttle closes at this speed [m/s]; the car does not reverse. The paper has no such limit,
+        see :data:`PAPER`
     :param steer_cost: reward weight
     :param brake_cost: reward weight
     :param crash_penalty: reward weight; None: 0 with the paper's reward, 20 with HighwayVision's
     :param event: ``bins``, ``representation``, ``threshold`` (one or a pair: positive, negative), ``threshold_sigma``
         (CARLA draws it anew for every event), ``refractory`` [s], ``mapping`` ("log", "identity"), ``log_eps`` and
-        ``tau`` of the event camera, see :data:`~sb3_have.envs.carla_vision.sensors.EVENT_DEFAULTS`
+        ``tau`` of the event camera, see :data:`~sb3_have.envs.carla_vision.sensors.EVENT_DEFAULTS`. A time surface
+        holds the events of the current control step only, whatever ``tau``
     :param depth: ``encoding`` and ``max`` as in HighwayVision-v0
     :param render_mode: None or "rgb_array" (RGB | event | depth side by side)
     :param scenario: "highway"; for other roads choose ``town`` and ``road_id``
@@ -163,38 +170,42 @@ class CarlaVisionEnv(gym.Env[Observation, np.ndarray]):
             raise ValueError(f"CARLA has no scenario {scenario!r}; choose another road by `town` and `road_id`")
         if isinstance(modalities, str) or not modalities or not set(modalities) <= set(MODALITIES):
             raise ValueError(f"modalities must be a non-empty subset of {MODALITIES}, got {modalities!r}")
-        for name, value, least in [
-            ("image_size", image_size, 16),
-            ("vehicles_count", vehicles_count, 0),
-            ("lanes_count", lanes_count, 1),
-            ("max_episode_steps", 1 if max_episode_steps is None else max_episode_steps, 1),
-            ("policy_frequency", policy_frequency, 1),
-            ("simulation_frequency", simulation_frequency, 10),
-            ("collision_ticks", 1 if collision_ticks is None else collision_ticks, 1),
-            ("port", port, 1),
-            ("tm_port", tm_port, 1024),
-        ]:
-            if not isinstance(value, int | np.integer) or value < least:
-                raise ValueError(f"{name} must be a whole number >= {least}, got {value!r}")
+        whole: list[tuple[str, Any, int, int | None]] = [
+            ("image_size", image_size, 16, None),
+            ("vehicles_count", vehicles_count, 0, None),
+            ("lanes_count", lanes_count, 1, None),
+            ("max_episode_steps", 1 if max_episode_steps is None else max_episode_steps, 1, None),
+            ("policy_frequency", policy_frequency, 1, None),
+            ("simulation_frequency", simulation_frequency, 10, None),
+            ("collision_ticks", 1 if collision_ticks is None else collision_ticks, 1, None),
+            ("port", port, 1, PORTS),
+            ("tm_port", tm_port, 1024, PORTS),
+            ("road_id", road_id, 0, None),
+        ]
+        for name, value, least, most in whole:
+            check_whole(name, value, least, most)
         if simulation_frequency % policy_frequency:
             raise ValueError(
                 f"simulation_frequency ({simulation_frequency} Hz) must be a multiple of "
                 f"policy_frequency ({policy_frequency} Hz), or control steps would lose time"
             )
-        for name, positive in [("timeout", timeout), ("steering_range", steering_range)]:
-            if positive is not None and not (np.isfinite(positive) and positive > 0):
-                raise ValueError(f"{name} must be positive, got {positive!r}")
-        if standstill_time is not None and not standstill_time > 0:
-            raise ValueError(f"standstill_time must be positive, got {standstill_time!r}")
-        if not (np.isfinite(event_grace) and event_grace >= 0):
-            raise ValueError(f"event_grace must be >= 0, got {event_grace!r}")
-        if traffic_speed is not None and (
-            np.shape(traffic_speed) != (2,) or not 0 < traffic_speed[0] <= traffic_speed[1]
-        ):
-            raise ValueError(f"traffic_speed must be None or a range of positive speeds [m/s], got {traffic_speed!r}")
+        for name, positive in [
+            ("timeout", timeout),
+            ("steering_range", 1.0 if steering_range is None else steering_range),
+        ]:
+            if not (is_finite(positive) and positive > 0):
+                raise ValueError(f"{name} must be a positive number, got {positive!r}")
+        if standstill_time is not None and not (is_number(standstill_time) and standstill_time > 0):
+            raise ValueError(f"standstill_time must be a positive number, got {standstill_time!r}")
+        if not (is_finite(event_grace) and event_grace >= 0):
+            raise ValueError(f"event_grace must be a number >= 0, got {event_grace!r}")
+        if traffic_speed is not None and not (is_pair(traffic_speed) and 0 < traffic_speed[0] <= traffic_speed[1]):
+            raise ValueError(
+                f"traffic_speed must be None or (least, greatest), positive and finite [m/s], got {traffic_speed!r}"
+            )
         self._reward = Reward(reward, steer_cost, brake_cost, collision_cost, crash_penalty, max_speed)
-        if not 0 <= initial_speed <= max_speed:
-            raise ValueError(f"initial_speed must lie in 0..max_speed ({max_speed} m/s), got {initial_speed!r}")
+        if not is_finite(initial_speed) or not 0 <= initial_speed <= max_speed:
+            raise ValueError(f"initial_speed must be a number in 0..max_speed ({max_speed} m/s), got {initial_speed!r}")
         self.weathers = weather_choices(weather)
         self.modalities = tuple(name for name in MODALITIES if name in modalities)
         self.max_episode_steps = max_episode_steps

@@ -9,6 +9,8 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from sb3_have.sensors.checks import is_finite
+
 RewardForm = Literal["paper", "highway"]
 
 #: Arc lengths of the road within which the ego and the traffic are put [m].
@@ -104,12 +106,12 @@ class Reward:
     def __post_init__(self) -> None:
         if self.form not in get_args(RewardForm):
             raise ValueError(f"reward must be one of {get_args(RewardForm)}, got {self.form!r}")
-        if not (math.isfinite(self.max_speed) and self.max_speed > 0):
-            raise ValueError(f"max_speed must be positive, got {self.max_speed!r}")
+        if not (is_finite(self.max_speed) and self.max_speed > 0):
+            raise ValueError(f"max_speed must be a positive number, got {self.max_speed!r}")
         for name in ("steer_cost", "brake_cost", "collision_cost", "crash_penalty"):
             weight = getattr(self, name)
-            if weight is not None and not (math.isfinite(weight) and weight >= 0):
-                raise ValueError(f"{name} must be >= 0 (it is subtracted from the reward), got {weight!r}")
+            if weight is not None and not (is_finite(weight) and weight >= 0):
+                raise ValueError(f"{name} must be a number >= 0 (it is subtracted from the reward), got {weight!r}")
 
     def __call__(
         self, speeds: Sequence[float], dt: float, throttle: float, steer: float, impulse: float, failed: bool

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sb3_have.envs.vision import DEPTH_DEFAULTS
 from sb3_have.envs.vision import EVENT_DEFAULTS as HIGHWAY_DEFAULTS
+from sb3_have.sensors.checks import check_whole, is_finite, positive_pair
 from sb3_have.sensors.depth import encode_depth
 from sb3_have.sensors.event_camera import EVENT_DTYPE
 from sb3_have.sensors.representations import encode_events, represent
@@ -221,7 +222,9 @@ def event_options(given: Mapping[str, Any] | None) -> dict[str, Any]:
     unknown = set(given) - set(EVENT_DEFAULTS)
     if unknown:
         raise ValueError(f"unknown event option {sorted(unknown)}; the options are {', '.join(EVENT_DEFAULTS)}")
-    return {**EVENT_DEFAULTS, **given}
+    options = {**EVENT_DEFAULTS, **given}
+    check_whole("event bins", options["bins"], 1)
+    return options
 
 
 def depth_options(given: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -251,18 +254,17 @@ def dvs_attributes(options: Mapping[str, Any]) -> dict[str, str]:
     :param options: As :func:`event_options` returns them.
     :raises ValueError: on a value that the sensor cannot have.
     """
-    thresholds = options["threshold"]
-    positive, negative = thresholds if np.ndim(thresholds) else (thresholds, thresholds)
-    if not (np.isfinite([positive, negative]).all() and min(positive, negative) > 0):
-        raise ValueError(f"event threshold must be positive, or a pair of such, got {thresholds!r}")
+    positive, negative = positive_pair("event threshold", options["threshold"])
     for name in ("threshold_sigma", "refractory", "log_eps"):
-        if not (np.isfinite(options[name]) and options[name] >= 0):
-            raise ValueError(f"event {name} must be >= 0, got {options[name]!r}")
+        if not (is_finite(options[name]) and options[name] >= 0):
+            raise ValueError(f"event {name} must be a number >= 0, got {options[name]!r}")
     if options["mapping"] not in ("log", "identity"):
         raise ValueError(f"CARLA's event camera maps light by 'log' or 'identity', got {options['mapping']!r}")
+    if options["mapping"] == "log" and options["log_eps"] == 0:
+        raise ValueError("event log_eps must be > 0 with mapping 'log', got 0: black has no logarithm")
     return {
-        "positive_threshold": str(float(positive)),
-        "negative_threshold": str(float(negative)),
+        "positive_threshold": str(positive),
+        "negative_threshold": str(negative),
         "sigma_positive_threshold": str(float(options["threshold_sigma"])),
         "sigma_negative_threshold": str(float(options["threshold_sigma"])),
         "refractory_period_ns": str(round(1e9 * options["refractory"])),
