@@ -233,7 +233,7 @@ def test_compose_shows_the_modalities_side_by_side() -> None:
         ({"modalities": ()}, "non-empty subset"),
         ({"modalities": ("rgb", "lidar")}, "lidar"),
         ({"modalities": "rgb"}, "non-empty subset"),
-        ({"image_size": 8}, "at least 16"),
+        ({"image_size": 8}, "image_size.*>= 16"),
         ({"image_size": 40.5}, "image_size.*whole number.*40.5"),
         ({"event": {"treshold": 0.1}}, r"\['treshold'\].*threshold"),
         ({"event": {"representation": "image"}}, "voxel"),

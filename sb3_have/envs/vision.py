@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from numbers import Integral, Real
 from typing import Any, Final
 
 import cv2
@@ -15,6 +14,7 @@ from sb3_have.envs.camera import Camera, Objects
 from sb3_have.envs.road_shape import RoadShape
 from sb3_have.envs.scene import PAINTS, Array
 from sb3_have.envs.weather import Illumination, rain_events, take_picture, weather_by_name
+from sb3_have.sensors.checks import check_whole, is_number
 from sb3_have.sensors.depth import encode_depth
 from sb3_have.sensors.event_camera import EventCamera
 from sb3_have.sensors.representations import (
@@ -59,8 +59,8 @@ class VisionSensors:
     :param image_size: Rows and columns of every image.
     :param modalities: Non-empty subset of ``"rgb"``, ``"event"``, ``"depth"``.
     :param event: Overrides of :data:`EVENT_DEFAULTS`: ``bins``, ``subframes`` (instants rendered per control step),
-        ``representation`` and, for a time surface, ``tau`` as :func:`~sb3_have.sensors.represent` has them (one control
-        step each), and the parameters of :class:`~sb3_have.sensors.EventCamera`. ``seed`` fixes the chip's threshold
+        ``representation`` and, for a time surface, ``tau`` as :func:`~sb3_have.sensors.represent` has them (of the
+        events of one control step, whatever ``tau``), and the parameters of :class:`~sb3_have.sensors.EventCamera`. ``seed`` fixes the chip's threshold
         mismatch; all noise comes from the generators given to :meth:`reset` and :meth:`observe`. With a ``mapping``
         other than "log" the event camera sees the digital numbers of the colour camera, neither clipped nor rounded.
     :param depth: Overrides of :data:`DEPTH_DEFAULTS`: ``encoding`` ("log", "clipped", "inverse") and, for the latter
@@ -79,11 +79,12 @@ class VisionSensors:
     ) -> None:
         if isinstance(modalities, str) or not modalities or not set(modalities) <= set(MODALITIES):
             raise ValueError(f"modalities must be a non-empty subset of {MODALITIES}, got {modalities!r}")
-        self.image_size = image_size = _whole("image_size", image_size, 16)
+        check_whole("image_size", image_size, 16)
+        self.image_size = image_size = int(image_size)
         self.modalities = tuple(name for name in MODALITIES if name in modalities)
         self.event_options = _options("event", EVENT_DEFAULTS, event)
         self.depth_options = _options("depth", DEPTH_DEFAULTS, depth)
-        if not isinstance(self.depth_options["max"], Real):
+        if not is_number(self.depth_options["max"]):
             raise ValueError(f"depth max must be a number of metres, got {self.depth_options['max']!r}")
         encode_depth(np.empty(0), *self.depth_options.values())  # complains about a wrong option now, not at reset
         if self.depth_options["encoding"] == "log" and "max" in (depth or {}):
@@ -94,8 +95,9 @@ class VisionSensors:
         self.camera = Camera(image_size, shape or RoadShape(4))
 
         chip = dict(self.event_options)
-        self.bins = _whole("event bins", chip.pop("bins"), 1)
-        self.subframes = _whole("event subframes", chip.pop("subframes"), 1)
+        for name in ("bins", "subframes"):
+            check_whole(f"event {name}", chip[name], 1)
+        self.bins, self.subframes = int(chip.pop("bins")), int(chip.pop("subframes"))
         #: What the event image shows, see :func:`~sb3_have.sensors.represent`.
         self.representation: Representation = chip.pop("representation")
         self._tau = chip.pop("tau")
@@ -229,12 +231,6 @@ class VisionSensors:
         size, kind = self.image_size, self.representation
         values = represent(pixel, times, polarity, self.bins, start, end, size, size, kind, self._tau)
         return encode_events(values, kind)
-
-
-def _whole(name: str, value: Any, least: int) -> int:
-    if not isinstance(value, Integral) or value < least:
-        raise ValueError(f"{name} must be a whole number of at least {least}, got {value!r}")
-    return int(value)
 
 
 def _options(name: str, defaults: Mapping[str, Any], given: Mapping[str, Any] | None) -> dict[str, Any]:
