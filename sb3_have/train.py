@@ -138,7 +138,7 @@ class Run:
     :param eval_freq: steps from one evaluation to the next, 0 for none
     :param eval_episodes: episodes in each weather of an evaluation
     :param eval_envs: processes that evaluate
-    :param eval_env_kwargs: for the evaluation's environments, in place of the configuration's ``env_kwargs``
+    :param eval_env_kwargs: for the evaluation's environments, over the configuration's ``env_kwargs``
     :param weathers: to evaluate in
     :param save_freq: steps from one checkpoint to the next, 0 for one at the end only
     :param time_limit: of the training in this call [s], None for none
@@ -163,7 +163,8 @@ class Run:
     ) -> None:
         self.config, self.env_id, self.out, self.seed, self.algo = dict(config), env_id, Path(out), seed, algo
         self.eval_freq, self.eval_episodes, self.eval_envs = eval_freq, eval_episodes, eval_envs
-        self.eval_env_kwargs = {**evaluation_env_kwargs(config), **(eval_env_kwargs or {})}
+        env_kwargs = {**config.get("env_kwargs", {}), **(eval_env_kwargs or {})}
+        self.eval_env_kwargs = evaluation_env_kwargs({"env_kwargs": env_kwargs})
         self.weathers, self.save_freq, self.time_limit = weathers, save_freq, time_limit
         self.device = device
         self.seconds = 0.0  # spent training and evaluating, over all sessions
@@ -336,7 +337,7 @@ def main(arguments: list[str] | None = None) -> None:
         default=[],
         type=hyperparameter,
         metavar="NAME:VALUE",
-        help="for the evaluation's environments, in place of the configuration's env_kwargs",
+        help="for the evaluation's environments, over the configuration's env_kwargs; not the weather",
     )
     parser.add_argument("--save-freq", type=int, default=5_000, help="steps between checkpoints")
     parser.add_argument("--time-limit", type=float, help="seconds of training in this session")

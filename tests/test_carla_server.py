@@ -204,6 +204,24 @@ def test_a_server_that_ticks_too_late_is_cleared_all_the_same(server: Server, en
     works(server, env)
 
 
+def test_one_port_for_two_traffic_managers(
+    monkeypatch: pytest.MonkeyPatch, server: Server, env: CarlaVisionEnv
+) -> None:
+    other = Server(port=2100)
+    install(monkeypatch, server, other)
+    env.reset()
+    second = CarlaVisionEnv(**BRIEF, port=2100)
+    with pytest.raises(RuntimeError, match=r"traffic manager on port 8000 .*localhost:2000.*tm_port="):
+        second.reset()
+    assert not other.calls
+    env.step(FULL)
+    alone = CarlaVisionEnv(**{**BRIEF, "vehicles_count": 0}, port=2100)
+    alone.reset()
+    alone.close()
+    env.close()
+    works(other, second)
+
+
 def test_two_servers_at_a_time(monkeypatch: pytest.MonkeyPatch, server: Server, env: CarlaVisionEnv) -> None:
     other = Server("Town01", port=2100)
     install(monkeypatch, server, other)

@@ -65,7 +65,7 @@ def test_evaluation_has_keywords_of_its_own(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(train, "evaluate", record)
     (tmp_path / "mine.yml").write_text(yaml.safe_dump({ENV_ID: {**CONFIG, "env_kwargs": {"weather": "fast"}}}))
     run = ["--config", str(tmp_path / "mine.yml"), "--env", ENV_ID, "--algo", "sac", "--steps", "1", "--eval-freq", "1"]
-    for number, more in enumerate(([], ["--eval-env-kwargs", "image_size:40", "port:2010"])):
+    for number, more in enumerate(([], ["--eval-env-kwargs", "image_size:40", "port:2010", "weather:slow"])):
         with pytest.raises(Enough):
             train.main([*run, "--out", str(tmp_path / str(number)), *more])
     assert evaluated == [{}, {"image_size": 40, "port": 2010}]

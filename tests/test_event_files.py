@@ -352,3 +352,13 @@ def test_h5py_is_imported_only_when_called(tmp_path: Path, monkeypatch: pytest.M
                 read_events(tmp_path / "events.h5")
             with pytest.raises(ImportError, match=r'pip install "sb3_have\[events\]"'):
                 write_events(tmp_path / "events.h5", recording(), HEIGHT, WIDTH)
+
+
+def test_the_end_of_the_index_by_the_last_bit(tmp_path: Path) -> None:
+    events = np.zeros(2, EVENT_DTYPE)
+    events["t"], events["p"] = [0.001, 0.1161], 1
+    write_events(tmp_path / "events.h5", events, HEIGHT, WIDTH)
+    with EventFile(tmp_path / "events.h5") as recorded:
+        for end in (np.nextafter(0.117, 0), 0.117, np.nextafter(0.117, 1), np.inf):
+            assert len(recorded.read(0, end)) == 2
+        assert len(recorded.read(0, 0.1161)) == 1

@@ -245,7 +245,7 @@ def test_compose_shows_the_modalities_side_by_side() -> None:
         ({"event": {"bins": 2.7}}, "bins.*whole number.*2.7"),
         ({"depth": {"maximum": 10}}, r"\['maximum'\].*max"),
         ({"depth": {"encoding": "linear"}}, "inverse"),
-        ({"depth": {"encoding": "clipped", "max": None}}, "max must be a number.*None"),
+        ({"depth": {"encoding": "clipped", "max": None}}, "maximum depth must be finite.*None"),
         ({"depth": {"max": 50}}, "max=50 has no effect.*log"),
     ],
 )

@@ -92,7 +92,11 @@ class GroundView:
         marking.reshape(-1)[between] *= self._dashes(along, between, DASH_PERIOD)
         if shape.ramps:
             # As is the road's edge beside the lane that a ramp becomes.
-            beside = _share_between(along % PERIOD, self.long, RAMP_JOINS, RAMP_ENDS)
+            since = along % PERIOD  # the footprint may also reach back to the ramp of the period before
+            beside = np.maximum(
+                _share_between(since, self.long, RAMP_JOINS, RAMP_ENDS),
+                _share_between(since + PERIOD, self.long, RAMP_JOINS, RAMP_ENDS),
+            )
             opened = np.flatnonzero((marking != 0) & (line == shape.lanes_count) & (beside != 0))
             gaps = 1 - self._dashes(along, opened, RAMP_DASH_PERIOD)
             marking.reshape(-1)[opened] *= 1 - beside.take(opened) * gaps

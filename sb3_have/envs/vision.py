@@ -14,7 +14,7 @@ from sb3_have.envs.camera import Camera, Objects
 from sb3_have.envs.road_shape import RoadShape
 from sb3_have.envs.scene import PAINTS, Array
 from sb3_have.envs.weather import Illumination, rain_events, take_picture, weather_by_name
-from sb3_have.sensors.checks import check_whole, is_number
+from sb3_have.sensors.checks import check_whole
 from sb3_have.sensors.depth import encode_depth
 from sb3_have.sensors.event_camera import EventCamera
 from sb3_have.sensors.representations import (
@@ -60,9 +60,10 @@ class VisionSensors:
     :param modalities: Non-empty subset of ``"rgb"``, ``"event"``, ``"depth"``.
     :param event: Overrides of :data:`EVENT_DEFAULTS`: ``bins``, ``subframes`` (instants rendered per control step),
         ``representation`` and, for a time surface, ``tau`` as :func:`~sb3_have.sensors.represent` has them (of the
-        events of one control step, whatever ``tau``), and the parameters of :class:`~sb3_have.sensors.EventCamera`. ``seed`` fixes the chip's threshold
-        mismatch; all noise comes from the generators given to :meth:`reset` and :meth:`observe`. With a ``mapping``
-        other than "log" the event camera sees the digital numbers of the colour camera, neither clipped nor rounded.
+        events of one control step, whatever ``tau``), and the parameters of :class:`~sb3_have.sensors.EventCamera`.
+        ``seed`` fixes the chip's threshold mismatch; all noise comes from the generators given to :meth:`reset` and
+        :meth:`observe`. With a ``mapping`` other than "log" the event camera sees the digital numbers of the colour
+        camera, neither clipped nor rounded.
     :param depth: Overrides of :data:`DEPTH_DEFAULTS`: ``encoding`` ("log", "clipped", "inverse") and, for the latter
         two, ``max`` in metres.
     :param shape: Of the road, as :func:`~sb3_have.envs.road_shape.road_shape` has them; 4 straight lanes by default.
@@ -83,15 +84,7 @@ class VisionSensors:
         self.image_size = image_size = int(image_size)
         self.modalities = tuple(name for name in MODALITIES if name in modalities)
         self.event_options = _options("event", EVENT_DEFAULTS, event)
-        self.depth_options = _options("depth", DEPTH_DEFAULTS, depth)
-        if not is_number(self.depth_options["max"]):
-            raise ValueError(f"depth max must be a number of metres, got {self.depth_options['max']!r}")
-        encode_depth(np.empty(0), *self.depth_options.values())  # complains about a wrong option now, not at reset
-        if self.depth_options["encoding"] == "log" and "max" in (depth or {}):
-            raise ValueError(
-                f"depth max={self.depth_options['max']!r} has no effect with encoding 'log', whose range is fixed; "
-                "leave it out or choose encoding 'clipped' or 'inverse'"
-            )
+        self.depth_options = depth_options(depth)
         self.camera = Camera(image_size, shape or RoadShape(4))
 
         chip = dict(self.event_options)
@@ -231,6 +224,23 @@ class VisionSensors:
         size, kind = self.image_size, self.representation
         values = represent(pixel, times, polarity, self.bins, start, end, size, size, kind, self._tau)
         return encode_events(values, kind)
+
+
+def depth_options(given: Mapping[str, Any] | None) -> dict[str, Any]:
+    """
+    :data:`DEPTH_DEFAULTS` with overrides.
+
+    :param given: ``encoding`` and, where it has one, ``max``.
+    :raises ValueError: on an unknown option, or a value that it cannot have.
+    """
+    options = _options("depth", DEPTH_DEFAULTS, given)
+    encode_depth(np.empty(0), *options.values())  # complains about a wrong option now, not at reset
+    if options["encoding"] == "log" and "max" in (given or {}):
+        raise ValueError(
+            f"depth max={options['max']!r} has no effect with encoding 'log', whose range is fixed; leave it out or "
+            "choose encoding 'clipped' or 'inverse'"
+        )
+    return options
 
 
 def _options(name: str, defaults: Mapping[str, Any], given: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -15,9 +15,8 @@ def is_number(value: Any, kind: type = Real) -> bool:
 
 
 def is_finite(value: Any) -> bool:
-    """Whether this is one number of Python or numpy, neither infinite nor NaN; a bool is 0 or 1."""
-    number = isinstance(value, Real)
-    return number and bool(-np.inf < value < np.inf)
+    """Whether this is one number of Python or numpy, neither infinite nor NaN; a bool is not."""
+    return is_number(value) and bool(-np.inf < value < np.inf)
 
 
 def is_pair(value: Any) -> bool:
@@ -29,13 +28,12 @@ def is_pair(value: Any) -> bool:
 def check_whole(name: str, value: Any, least: int, most: int | None = None) -> None:
     """
     :param name: Of the option, for the message.
-    :param value: What was given; a bool is 0 or 1.
+    :param value: What was given.
     :param least: Smallest value.
     :param most: Greatest value, if there is one.
     :raises ValueError: unless it is a whole number of Python or numpy in these bounds.
     """
-    whole = isinstance(value, Integral)
-    if not whole or value < least or (most is not None and value > most):
+    if not is_number(value, Integral) or value < least or (most is not None and value > most):
         bounds = f">= {least}" if most is None else f"in {least}..{most}"
         raise ValueError(f"{name} must be a whole number {bounds}, got {value!r}")
 

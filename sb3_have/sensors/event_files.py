@@ -260,9 +260,9 @@ class EventFile:
 
     def _bracket(self, time: float) -> tuple[int, int]:
         """Rows between which that one lies: by the index of milliseconds, as far as the time stamps bear it out."""
-        if self._index is None or not 0 < time < len(self._index) / 1e3:
+        millisecond = math.floor(time * 1e3) if np.isfinite(time) else -1
+        if self._index is None or time <= 0 or not 0 <= millisecond < len(self._index):
             return 0, self._size
-        millisecond = math.floor(time * 1e3)
         low, *rest = (int(row) for row in self._index[millisecond : millisecond + 2])
         high = rest[0] if rest else self._size
         fits = 0 <= low <= high <= self._size

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from numbers import Integral
 from typing import Any, Final
 
 import cv2
@@ -14,7 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from sb3_have.sensors.checks import describe, is_number, parse_size, pick
+from sb3_have.sensors.checks import check_whole, describe, is_number, parse_size, pick
 from sb3_have.sensors.event_camera import EventCamera
 from sb3_have.sensors.rendering import (
     COLOUR_MODES,
@@ -117,8 +116,7 @@ class EventObservation(SensorWrapper):
         )
         SensorWrapper.__init__(self, env, key)
         self.source, self.bins, self.representation, self.tau = source, bins, representation, tau
-        if not is_number(bins, Integral):
-            raise ValueError(f"bins must be a whole number, got {bins!r}")
+        check_whole("bins", bins, 1)
         if dt is not None and not (is_number(dt) and 0 < dt < np.inf):
             raise ValueError(f"dt must be a finite number of seconds > 0, got {dt!r}")
         if dt is None and step_duration(env) is None:

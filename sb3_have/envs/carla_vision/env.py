@@ -13,8 +13,8 @@ import numpy as np
 from gymnasium import spaces
 
 from sb3_have.envs.carla_vision.rules import COLLISION_TICKS, STANDSTILL_TIME, Plan, Reward, RewardForm, Server, Trip
-from sb3_have.envs.carla_vision.sensors import depth_options, dvs_attributes, event_image, event_options
-from sb3_have.envs.vision import MODALITIES, Observation, compose
+from sb3_have.envs.carla_vision.sensors import dvs_attributes, event_image, event_options
+from sb3_have.envs.vision import MODALITIES, Observation, compose, depth_options
 from sb3_have.envs.weather import weather_choices
 from sb3_have.sensors.checks import check_whole, is_finite, is_number, is_pair
 

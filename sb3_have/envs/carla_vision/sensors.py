@@ -12,10 +12,8 @@ from typing import Any, Final, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_have.envs.vision import DEPTH_DEFAULTS
 from sb3_have.envs.vision import EVENT_DEFAULTS as HIGHWAY_DEFAULTS
 from sb3_have.sensors.checks import check_whole, is_finite, positive_pair
-from sb3_have.sensors.depth import encode_depth
 from sb3_have.sensors.event_camera import EVENT_DTYPE
 from sb3_have.sensors.representations import encode_events, represent
 
@@ -224,26 +222,6 @@ def event_options(given: Mapping[str, Any] | None) -> dict[str, Any]:
         raise ValueError(f"unknown event option {sorted(unknown)}; the options are {', '.join(EVENT_DEFAULTS)}")
     options = {**EVENT_DEFAULTS, **given}
     check_whole("event bins", options["bins"], 1)
-    return options
-
-
-def depth_options(given: Mapping[str, Any] | None) -> dict[str, Any]:
-    """
-    :data:`~sb3_have.envs.vision.DEPTH_DEFAULTS` with overrides.
-
-    :param given: Options as HighwayVision-v0 takes them.
-    :raises ValueError: on an unknown option, or a value that it cannot have.
-    """
-    unknown = set(given or {}) - set(DEPTH_DEFAULTS)
-    if unknown:
-        raise ValueError(f"unknown depth option {sorted(unknown)}; the options are {', '.join(DEPTH_DEFAULTS)}")
-    options = {**DEPTH_DEFAULTS, **(given or {})}
-    encode_depth(np.empty(0), *options.values())  # complains about a wrong option now, not at reset
-    if options["encoding"] == "log" and "max" in (given or {}):
-        raise ValueError(
-            f"depth max={options['max']!r} has no effect with encoding 'log', whose range is fixed; leave it out or "
-            "choose encoding 'clipped' or 'inverse'"
-        )
     return options
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import uuid
 from collections.abc import Callable, Iterable
+from contextlib import suppress
 from typing import Any, Final, cast
 
 import carla
@@ -13,8 +14,6 @@ from sb3_have.envs.carla_vision.rules import CarlaConnectionError, Server
 
 #: Loading a map takes longer than any other call [s].
 LOAD_TIMEOUT: Final = 120.0
-#: How long to wait for a sign of life before giving a server up [s].
-PING_TIMEOUT: Final = 5.0
 #: The roles of all actors begin so.
 ROLE: Final = "sb3_have-"
 
@@ -68,21 +67,33 @@ class Session:
                 f"this process already drives the CARLA server at {where}; give every environment a server of its own: "
                 "port=..., tm_port=..."
             )
+        # CARLA keeps the traffic managers of a process by their port alone, whatever server they belong to.
+        for driver in _drivers.values():
+            if (
+                driver is not self
+                and server.traffic
+                and driver.server.traffic
+                and driver.server.tm_port == server.tm_port
+            ):
+                raise RuntimeError(
+                    f"this process has a traffic manager on port {server.tm_port} already, for the CARLA server at "
+                    f"{driver.server.host}:{driver.server.port}; give every environment its own: tm_port=..."
+                )
         try:
             self.client = carla.Client(server.host, server.port)
             self.client.set_timeout(server.timeout)
-            theirs = self.client.get_server_version()
+            version = self.client.get_server_version()
             self.world = self.client.get_world()
         except RuntimeError as error:
             self.lost = True
             raise self.connection_error("no CARLA server at") from error
         self._connected = True
         ours = self.client.get_client_version()
-        if ours != theirs:
+        if ours != version:
             gym.logger.warn(
-                f"CARLA client {ours} talks to a server of version {theirs}: calls may fail or mean something else, "
+                f"CARLA client {ours} talks to a server of version {version}: calls may fail or mean something else, "
                 "and images may bear frame numbers that are off by some ticks. Install the client of that version: "
-                f"pip install carla=={theirs}"
+                f"pip install carla=={version}"
             )
         original, weather = self.world.get_settings(), self.world.get_weather()
         if taken_over := original.synchronous_mode:
@@ -193,8 +204,11 @@ class Session:
 
     def _stop_sensors(self) -> None:
         while self._listening:
-            if self._listening[-1].is_listening():
-                self._listening[-1].stop()
+            for _ in range(2):  # one error may pass; a sensor that does not stop must not keep the others
+                with suppress(RuntimeError):
+                    if self._listening[-1].is_listening():
+                        self._listening[-1].stop()
+                    break
             self._listening.pop()
 
     def _destroy(self, role: str | None = None) -> None:
@@ -285,9 +299,8 @@ class Session:
     def _alive(self) -> bool:
         for _ in range(2):  # one error of another kind is no sign of death
             try:
-                self.client.set_timeout(min(self.server.timeout, PING_TIMEOUT))
+                self.client.set_timeout(self.server.timeout)  # loading a town may have left another
                 self.client.get_server_version()
-                self.client.set_timeout(self.server.timeout)
                 return True
             except RuntimeError as error:
                 if "time-out" in str(error):
