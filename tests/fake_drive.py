@@ -9,6 +9,18 @@ from gymnasium.envs.registration import register
 
 ENV_ID = "fake_drive:FakeDrive-v0"
 
+#: A short training of a small model on it.
+CONFIG: dict[str, Any] = {
+    "n_timesteps": 100,
+    "frame_stack": 2,
+    "env_kwargs": {"weather": "fast"},
+    "policy": "MultiInputPolicy",
+    "buffer_size": 50,
+    "batch_size": 4,
+    "learning_starts": 5,
+    "policy_kwargs": {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 8}},
+}
+
 
 class FakeDrive(gym.Env[Any, np.ndarray]):
     """Drives ``seed % 5 + 4`` steps; return and distance follow from the weather, the seed and the throttle.

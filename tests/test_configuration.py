@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium as gym
 import pytest
 import yaml
-from fake_drive import ENV_ID
+from fake_drive import CONFIG, ENV_ID
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 
 from sb3_have import train
@@ -23,16 +23,6 @@ from sb3_have.configuration import (
 )
 from sb3_have.train import Run
 
-CONFIG: dict[str, Any] = {
-    "n_timesteps": 100,
-    "frame_stack": 2,
-    "env_kwargs": {"weather": "fast"},
-    "policy": "MultiInputPolicy",
-    "buffer_size": 50,
-    "batch_size": 4,
-    "learning_starts": 5,
-    "policy_kwargs": {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 8}},
-}
 #: Ends every episode after two steps.
 SHORT = {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 2}}
 

@@ -4,9 +4,8 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
-from fake_drive import ENV_ID
+from fake_drive import CONFIG, ENV_ID
 from PIL import Image
-from test_train import CONFIG
 
 from sb3_have import HAVESAC, demo
 

@@ -8,23 +8,12 @@ from typing import Any
 import pandas as pd
 import pytest
 import torch as th
-from fake_drive import ENV_ID
+from fake_drive import CONFIG, ENV_ID
 
 import sb3_have
 from sb3_have import train
 from sb3_have.configuration import load_config, model_kwargs
 from sb3_have.train import Run, newest_checkpoint
-
-CONFIG: dict[str, Any] = {
-    "n_timesteps": 100,
-    "frame_stack": 2,
-    "env_kwargs": {"weather": "fast"},
-    "policy": "MultiInputPolicy",
-    "buffer_size": 50,
-    "batch_size": 4,
-    "learning_starts": 5,
-    "policy_kwargs": {"net_arch": [8], "features_extractor_kwargs": {"cnn_output_dim": 8}},
-}
 
 
 def make_run(out: Path, **kwargs: Any) -> Run:
