@@ -166,6 +166,17 @@ def test_nothing_of_a_ramp_begins_or_ends_within_a_pixel(place: float) -> None:
     assert halves > 0 or place > 0
 
 
+def test_footprints_that_reach_back_into_the_period_before() -> None:
+    camera, _ = road("merge")
+    distance, length = float(camera.ground_forward[0, 0]), float(camera.ground_view.long[0, 0])
+    assert length > 100  # so the first row sees the end of one ramp and the beginning of the next
+    at = [
+        camera.ground(np.array([[(RAMP_START - 1 - distance + offset, 12.0, 0.0)]])).marking[0, 0]
+        for offset in (-0.1, 0.1)
+    ]
+    assert np.abs(at[1] - at[0]).max() < 1e-3
+
+
 @pytest.mark.parametrize("scenario", NEW)
 def test_what_is_road_for_cars_is_pavement_and_little_else(scenario: str) -> None:
     """Every near pixel of the ground against the lanes: on a lane there is road, beyond the shoulder there is none."""

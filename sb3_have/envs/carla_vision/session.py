@@ -68,16 +68,11 @@ class Session:
                 "port=..., tm_port=..."
             )
         # CARLA keeps the traffic managers of a process by their port alone, whatever server they belong to.
-        for driver in _drivers.values():
-            if (
-                driver is not self
-                and server.traffic
-                and driver.server.traffic
-                and driver.server.tm_port == server.tm_port
-            ):
+        for other in (driver.server for driver in _drivers.values() if driver is not self):
+            if server.traffic and other.traffic and other.tm_port == server.tm_port:
                 raise RuntimeError(
                     f"this process has a traffic manager on port {server.tm_port} already, for the CARLA server at "
-                    f"{driver.server.host}:{driver.server.port}; give every environment its own: tm_port=..."
+                    f"{other.host}:{other.port}; give every environment its own: tm_port=..."
                 )
         try:
             self.client = carla.Client(server.host, server.port)
