@@ -1,18 +1,22 @@
 """From raw observations to features: decoding, grouping, own encoders, frame stacking."""
 
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from envs import IMAGE_SIZE, RandomSensors, image, tiny_model, vector
+from envs import IMAGE_SIZE, RandomSensors, batched, changed, clone_parameters, image, sensors_space, tiny_model, vector
 from gymnasium import spaces
+from sb3_contrib import TQC
+from stable_baselines3 import SAC
 from stable_baselines3.common.torch_layers import NatureCNN
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 from sb3_have import HAVESAC
-from sb3_have.common.encoders import ImageEncoder, MultiModalEncoder, VectorEncoder
+from sb3_have.common.crossq import MultiInputCrossQ
+from sb3_have.common.encoders import ImageEncoder, MultiModalEncoder, MultiModalExtractor, VectorEncoder
 
 SIZE = IMAGE_SIZE
 
@@ -238,3 +242,73 @@ def test_default_layers_by_size(size: int, expected: list[tuple[int, int, int]])
     """Nature DQN's for small images, the paper's from 112 pixels on."""
     layers = [m for m in ImageEncoder(channel_first(3, size)).convolutions if isinstance(m, th.nn.Conv2d)]
     assert [(layer.out_channels, layer.kernel_size[0], layer.stride[0]) for layer in layers] == expected
+
+
+OFF_THE_SHELF: list[Any] = [SAC, TQC, MultiInputCrossQ]
+
+
+def off_the_shelf(algorithm: Any, space: spaces.Space[Any], **policy_kwargs: Any) -> Any:
+    """A small model on :class:`MultiModalExtractor`, on random observations of ``space``."""
+    kwargs = {
+        "features_extractor_class": MultiModalExtractor,
+        "features_extractor_kwargs": {"features_dim": 8, "precision": "float32"},
+        "normalize_images": False,
+        "net_arch": [16],
+        **policy_kwargs,
+    }
+    return algorithm(
+        "MultiInputPolicy",
+        RandomSensors(space),
+        learning_starts=8,
+        batch_size=8,
+        buffer_size=50,
+        seed=0,
+        device="cpu",
+        policy_kwargs=kwargs,
+    )
+
+
+@pytest.mark.parametrize("algorithm", OFF_THE_SHELF)
+def test_extractor_gives_the_features_of_the_raw_bytes(algorithm: Any) -> None:
+    """What SB3 makes of an observation on its way to the extractor changes no bit of the features."""
+    model = off_the_shelf(algorithm, sensors_space())
+    extractor = model.critic.features_extractor
+    assert extractor.features_dim == 3 * 8
+    space = model.observation_space
+    space.seed(0)
+    observation = {key: np.stack([space[key].sample() for _ in range(4)]) for key in space.spaces}
+    observation["event"][0] = 128  # nothing happened
+    observation["event"][1] = 0  # no data
+    reference = MultiModalEncoder(space, 8, precision="float32")
+    reference.load_state_dict(extractor.encoder.state_dict())
+    expected = reference({key: th.as_tensor(value) for key, value in observation.items()}).flatten(start_dim=1)
+    tensors, _ = model.policy.obs_to_tensor(observation)
+    assert th.equal(model.critic.extract_features(tensors, extractor), expected)
+
+
+@pytest.mark.parametrize("algorithm", OFF_THE_SHELF)
+def test_extractor_is_trained_and_comes_back(algorithm: Any, tmp_path: Path) -> None:
+    model = off_the_shelf(algorithm, sensors_space())
+    before = clone_parameters(model.critic.features_extractor)
+    model.learn(12)
+    assert changed(before, model.critic.features_extractor) == set(before)
+    model.save(tmp_path / "model")
+    loaded = algorithm.load(tmp_path / "model", device="cpu")
+    observation = batched(RandomSensors(sensors_space()).observation_space.sample())
+    first, second = (one.predict(observation, deterministic=True)[0] for one in (model, loaded))
+    assert np.array_equal(first, second)
+
+
+@pytest.mark.parametrize("space", [sensors_space(), image(3)])
+def test_extractor_refuses_images_that_sb3_has_scaled(space: spaces.Space[Any]) -> None:
+    model = off_the_shelf(SAC, space, normalize_images=True)
+    with pytest.raises(ValueError, match=r"'(rgb|event|observation)': expected the bytes.*normalize_images=False"):
+        model.predict(RandomSensors(space).observation_space.sample())
+
+
+def test_extractor_takes_floats_as_they_are_where_it_is_told_to() -> None:
+    space = spaces.Dict({"rgb": spaces.Box(0, 1, (3, SIZE, SIZE), np.float32)})
+    kwargs = {"features_dim": 8, "precision": "float32", "normalize_images": False}
+    extractor = MultiModalExtractor(space, **kwargs)  # type: ignore[arg-type]
+    observation = {"rgb": th.rand(2, 3, SIZE, SIZE)}
+    assert th.equal(extractor(observation), extractor.encoder(observation)[:, 0])

@@ -11,6 +11,7 @@ import torch as th
 import torch.nn.functional as F
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
@@ -201,6 +202,56 @@ class MultiModalEncoder(nn.Module):
             return _look_up(observation, signed, dtype)
         observation = observation.contiguous(memory_format=th.channels_last)  # before it has more bytes
         return (decode_bytes(observation, signed) if self.normalize_images else observation).to(dtype)
+
+
+class MultiModalExtractor(BaseFeaturesExtractor):
+    """
+    The encoders of HAVESAC for SB3's other algorithms: the concatenated features of :class:`MultiModalEncoder`::
+
+        TQC("MultiInputPolicy", env,
+            policy_kwargs=dict(features_extractor_class=MultiModalExtractor, normalize_images=False))
+
+    ``normalize_images=False`` keeps SB3 from dividing all images by 255; the encoder decodes them, signed counts by a
+    scale of their own.
+
+    :param observation_space: as :class:`MultiModalEncoder` takes it
+    :param features_dim: F, the size of each modality's features; the property ``features_dim`` of SB3 is d * F
+    :param encoder_kwargs: further arguments of :class:`MultiModalEncoder`
+    :raises ValueError: as :class:`MultiModalEncoder` does, and in ``forward`` for images that SB3 has scaled already
+    """
+
+    def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 50, **encoder_kwargs: Any):
+        encoder = MultiModalEncoder(observation_space, features_dim, **encoder_kwargs)
+        super().__init__(observation_space, len(encoder.modalities) * features_dim)
+        self.encoder = encoder
+        # SB3 gives all as floats; these are to be bytes again
+        self.byte_keys = [
+            key
+            for modality in encoder.modalities.values()
+            for key in modality.keys
+            if modality.is_image and encoder.normalize_images
+        ]
+        self._has_seen_bytes = False
+
+    def forward(self, observations: PyTorchObs) -> th.Tensor:
+        """Features (B, d*F) of observations whose images hold 0..255, of any type."""
+        raw = dict(observations) if isinstance(observations, dict) else {"observation": observations}
+        for key in self.byte_keys:
+            self._check_scale(key, raw[key])
+            raw[key] = raw[key].to(th.uint8)
+        features: th.Tensor = self.encoder(raw).flatten(start_dim=1)
+        return features
+
+    def _check_scale(self, key: str, images: th.Tensor) -> None:
+        if self._has_seen_bytes or th.compiler.is_compiling():
+            return
+        if images.is_floating_point() and (images != images.round()).any():
+            raise ValueError(
+                f"observation key {key!r}: expected the bytes of an image, 0..255, got fractions such as "
+                f"{images[images != images.round()][0]:.3g}; keep SB3 from scaling it, by "
+                "`policy_kwargs=dict(features_extractor_class=MultiModalExtractor, normalize_images=False)`."
+            )
+        self._has_seen_bytes = bool((images > 1).any())  # what SB3 has scaled never is
 
 
 def decode_bytes(values: th.Tensor, signed: bool) -> th.Tensor:
