@@ -21,7 +21,8 @@ import torch as th
 from stable_baselines3.common.monitor import load_results
 
 from sb3_have.common.drivers import KeepStraightDriver, RandomDriver
-from sb3_have.common.evaluation import Predictor, evaluate, format_table
+from sb3_have.common.episodes import Predictor
+from sb3_have.common.evaluation import evaluate, format_table
 from sb3_have.common.memory import keep_freed_memory
 from sb3_have.common.plotting import plot_learning_curve, plot_modality_weights, write_gif
 from sb3_have.common.recording import record_episode

@@ -34,7 +34,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 import sb3_have
 from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
-from sb3_have.common.evaluation import evaluate, leave_interrupts_to_parent
+from sb3_have.common.episodes import leave_interrupts_to_parent
+from sb3_have.common.evaluation import evaluate
 from sb3_have.common.memory import keep_freed_memory
 from sb3_have.configuration import env_wrapper, evaluation_env_kwargs, hyperparameter, load_config, model_kwargs
 from sb3_have.envs.weather import WEATHERS

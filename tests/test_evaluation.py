@@ -12,7 +12,8 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 
 from sb3_have.common.drivers import KeepStraightDriver, RandomDriver
-from sb3_have.common.evaluation import evaluate, evaluate_episodes, format_table, match_observations
+from sb3_have.common.episodes import match_observations
+from sb3_have.common.evaluation import evaluate, evaluate_episodes, format_table
 
 WEATHERS = ("slow", "fast")
 

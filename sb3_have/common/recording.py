@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_have.common.evaluation import EpisodeQueue, Predictor, Task, match_observations
+from sb3_have.common.episodes import EpisodeQueue, Predictor, Task, match_observations
 
 
 @dataclass
