@@ -58,6 +58,7 @@ class MultiModalPolicy(SACPolicy):
     critic: MultiModalCritic  # type: ignore[assignment]
     critic_target: MultiModalCritic  # type: ignore[assignment]
     default_auxiliary_losses: ClassVar[dict[str, type[AuxiliaryLoss]]] = {"deepmdp": DeepMDP}
+    critic_class: ClassVar[type[MultiModalCritic]] = MultiModalCritic
 
     def __init__(
         self,
@@ -151,7 +152,7 @@ class MultiModalPolicy(SACPolicy):
             normalize_images=self.normalize_images,
             **self.encoder_kwargs,
         )
-        return MultiModalCritic(
+        return self.critic_class(
             self.observation_space,
             self.action_space,  # type: ignore[arg-type]
             encoder,
