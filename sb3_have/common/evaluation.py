@@ -5,11 +5,12 @@ from __future__ import annotations
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import pandas as pd
+from numpy.typing import ArrayLike
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 from tqdm import tqdm
 
@@ -143,3 +144,165 @@ def _pooled(frame: pd.DataFrame, name: str) -> tuple[float, float]:
     pooled = float(np.average(mean, weights=weight))
     variance = np.average(frame[f"{name}_std"].to_numpy(float) ** 2 + (mean - pooled) ** 2, weights=weight)
     return pooled, float(np.sqrt(variance))
+
+
+# Statistics over runs, after Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice"
+# (NeurIPS 2021). A table of scores has a row for each run (seed) and a column for each task (weather). Every statistic
+# also takes a stack of tables, (..., n_runs, n_tasks), and gives one value for each: so the bootstrap needs no loop.
+
+
+class Interval(NamedTuple):
+    """A statistic with its confidence interval."""
+
+    estimate: float
+    lower: float
+    upper: float
+
+
+class Band(NamedTuple):
+    """A curve with its confidence interval at each point, all of shape (n_points,)."""
+
+    estimate: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+def mean(scores: ArrayLike) -> Any:
+    """Mean over runs and tasks.
+
+    :param scores: (n_runs, n_tasks), or a stack of such tables (..., n_runs, n_tasks)
+    :return: a float, or (...) for a stack
+    :raises ValueError: if scores are not such a table, or not finite
+    """
+    return _table(scores).mean(axis=(-2, -1))
+
+
+def median(scores: ArrayLike) -> Any:
+    """Median over tasks of the mean over runs; parameters as for :func:`mean`."""
+    return np.median(_table(scores).mean(axis=-2), axis=-1)
+
+
+def iqm(scores: ArrayLike) -> Any:
+    """Interquartile mean: of all runs on all tasks together, the mean without the lowest and the highest quarter.
+
+    A quarter of n scores is ``n // 4``, so fewer than four are all kept. Parameters as for :func:`mean`.
+    """
+    table = _table(scores)
+    pooled = np.sort(table.reshape(*table.shape[:-2], -1), axis=-1)
+    cut = pooled.shape[-1] // 4
+    return pooled[..., cut : pooled.shape[-1] - cut].mean(axis=-1)
+
+
+def optimality_gap(scores: ArrayLike, target: float = 1.0) -> Any:
+    """By how much scores fall short of a target, on average; what exceeds it does not make up for it.
+
+    :param scores: as for :func:`mean`
+    :param target: in the scores' unit
+    :return: at least 0, a float, or (...) for a stack
+    """
+    return np.maximum(target - _table(scores), 0.0).mean(axis=(-2, -1))
+
+
+def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> Any:
+    """How often a run of ``x`` beats one of ``y`` on the same task: mean over tasks of Mann-Whitney's U / (N M).
+
+    :param x: (N, n_tasks) scores, or a stack (..., N, n_tasks)
+    :param y: (M, n_tasks) scores on the same tasks, in a stack of the same shape
+    :return: 0..1, ties count half; a float, or (...) for stacks
+    :raises ValueError: if tasks differ in number, or scores are not tables or not finite
+    """
+    left, right = _table(x), _table(y)
+    if left.shape[:-2] != right.shape[:-2] or left.shape[-1] != right.shape[-1]:
+        raise ValueError(f"x and y need the same tasks (columns), got shapes {left.shape} and {right.shape}")
+    left, right = left[..., :, None, :], right[..., None, :, :]
+    wins = np.mean(left > right, axis=(-3, -2, -1))
+    return wins + 0.5 * np.mean(left == right, axis=(-3, -2, -1))
+
+
+def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> np.ndarray:
+    """Share of runs, over all tasks, that score above each threshold.
+
+    :param scores: as for :func:`mean`
+    :param thresholds: (n_thresholds,), in the scores' unit
+    :return: (n_thresholds,), or (..., n_thresholds) for a stack, 0..1
+    :raises ValueError: if thresholds are no vector of finite numbers, or scores no finite table
+    """
+    table, levels = _table(scores), np.asarray(thresholds, dtype=float)
+    if levels.ndim != 1 or not levels.size or not np.isfinite(levels).all():
+        raise ValueError(f"thresholds must be a vector of finite numbers, got {thresholds!r}")
+    return np.stack([np.mean(table > level, axis=(-2, -1)) for level in levels], axis=-1)
+
+
+def stratified_bootstrap(
+    statistic: Callable[..., Any],
+    *scores: ArrayLike,
+    n_resamples: int = 2000,
+    confidence: float = 0.95,
+    seed: int = 0,
+) -> Interval:
+    """Percentile bootstrap that draws runs anew within each task, for each task and each table on its own.
+
+    ``stratified_bootstrap(iqm, scores)`` and ``stratified_bootstrap(probability_of_improvement, x, y)`` are its uses.
+    The interval covers too seldom when runs are few: with three, nothing lies beyond the best and the worst of them.
+
+    :param statistic: of tables, reduces their last two axes: one of this module's, or e.g.
+        ``partial(optimality_gap, target=500.0)``
+    :param scores: its tables (n_runs, n_tasks), at least two runs each
+    :param n_resamples: of the bootstrap
+    :param confidence: between 0 and 1
+    :param seed: of the resampling
+    :raises ValueError: if a table has one run only (nothing would vary), or is no finite table, or
+        ``n_resamples`` or ``confidence`` are out of range
+    """
+    estimate, lower, upper = _bootstrap(statistic, scores, n_resamples, confidence, seed)
+    return Interval(float(estimate), float(lower), float(upper))
+
+
+def performance_profile_band(
+    scores: ArrayLike, thresholds: ArrayLike, n_resamples: int = 2000, confidence: float = 0.95, seed: int = 0
+) -> Band:
+    """:func:`performance_profile` with its pointwise confidence interval; parameters as there and as for
+    :func:`stratified_bootstrap`."""
+    profile = partial(performance_profile, thresholds=thresholds)
+    return Band(*_bootstrap(profile, (scores,), n_resamples, confidence, seed))
+
+
+def _bootstrap(
+    statistic: Callable[..., Any], scores: Sequence[ArrayLike], n_resamples: int, confidence: float, seed: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Estimate, lower and upper bound, each of the statistic's shape."""
+    if n_resamples < 1 or not 0 < confidence < 1:
+        raise ValueError(f"need n_resamples >= 1 and 0 < confidence < 1, got {n_resamples} and {confidence}")
+    tables = [_table(table) for table in scores]
+    for table in tables:
+        if table.ndim != 2:
+            raise ValueError(f"the bootstrap takes single tables (n_runs, n_tasks), got shape {table.shape}")
+        if len(table) < 2:
+            raise ValueError(
+                f"a confidence interval needs at least 2 runs, got scores of shape {table.shape}: "
+                "resamples of a single run are all alike; add seeds, or report the estimate alone"
+            )
+    rng = np.random.default_rng(seed)
+    resampled = []
+    for table in tables:
+        runs = rng.integers(len(table), size=(n_resamples, *table.shape))
+        resampled.append(table[runs, np.arange(table.shape[1])])
+    estimate, values = np.asarray(statistic(*tables)), np.asarray(statistic(*resampled))
+    if values.shape != (n_resamples, *estimate.shape):
+        raise ValueError(f"the statistic must reduce the last two axes, (..., n_runs, n_tasks); got {statistic}")
+    tail = (1.0 - confidence) / 2
+    lower, upper = np.quantile(values, [tail, 1.0 - tail], axis=0)
+    return estimate, lower, upper
+
+
+def _table(scores: ArrayLike) -> np.ndarray:
+    """Scores as float64 (..., n_runs, n_tasks)."""
+    table = np.asarray(scores, dtype=np.float64)
+    if table.ndim < 2 or 0 in table.shape:
+        raise ValueError(
+            f"scores must be a table (n_runs, n_tasks) with at least one of each, got shape {table.shape}; "
+            "for a single task give scores[:, None]"
+        )
+    if not np.isfinite(table).all():
+        raise ValueError(f"scores must be finite, got {np.count_nonzero(~np.isfinite(table))} NaN or infinite values")
+    return table
