@@ -14,6 +14,8 @@ import gymnasium as gym
 import yaml
 
 Env = gym.Env[Any, Any]
+CLASS_OR_WORD = ("policy", "activation_fn", "fusion", "auxiliary")
+"""Keys whose value names a class by its dotted path, or something else by a word."""
 
 
 def config_path(name: str) -> Path:
@@ -51,10 +53,33 @@ def evaluation_env_kwargs(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def model_kwargs(config: Mapping[str, Any]) -> dict[str, Any]:
-    """What of a configuration goes to the algorithm's constructor."""
+    """What of a configuration goes to the algorithm's constructor.
+
+    Dotted paths become what they name under every key that ends in ``_class`` or ``_classes``, and under ``policy``,
+    ``activation_fn``, ``fusion`` and ``auxiliary``, which may be words too::
+
+        policy_kwargs:
+          features_extractor_class: sb3_have.common.encoders.MultiModalExtractor
+          activation_fn: torch.nn.Tanh
+
+    The Zoo does so for ``policy`` alone; in its own format the rest would be Python in a string, which it evaluates
+    without knowing this package.
+
+    :raises ValueError: if a path leads nowhere
+    """
     for_others = {"n_timesteps", "n_envs", "frame_stack", "env_kwargs", "env_wrapper"}
-    # copied, because SB3 writes into policy_kwargs
-    return {key: deepcopy(value) for key, value in config.items() if key not in for_others}
+    return {key: _resolve(key, value) for key, value in config.items() if key not in for_others}
+
+
+def _resolve(key: str, value: Any) -> Any:
+    """A copy, because SB3 writes into policy_kwargs, with classes for their paths."""
+    is_class = key.endswith(("_class", "_classes"))
+    if isinstance(value, Mapping):
+        inherited = key if is_class or key in CLASS_OR_WORD else None
+        return {name: _resolve(inherited or name, item) for name, item in value.items()}
+    if isinstance(value, str) and (is_class or (key in CLASS_OR_WORD and "." in value)):
+        return _locate(value, key)
+    return deepcopy(value)
 
 
 def env_wrapper(config: Mapping[str, Any]) -> Callable[[Env], Env] | None:
@@ -84,7 +109,7 @@ def env_wrapper(config: Mapping[str, Any]) -> Callable[[Env], Env] | None:
             path, kwargs = entry, None
         if not isinstance(path, str) or not isinstance(kwargs, Mapping | None):
             raise ValueError(f"an env_wrapper is 'module.Class' or 'module.Class: {{keyword: value}}', got {entry!r}")
-        wrappers.append((_locate(path), dict(kwargs or {})))
+        wrappers.append((_locate(path, "env_wrapper"), dict(kwargs or {})))
     return partial(_wrap, wrappers)
 
 
@@ -94,13 +119,13 @@ def _wrap(wrappers: list[tuple[Callable[..., Env], dict[str, Any]]], env: Env) -
     return env
 
 
-def _locate(path: str) -> Callable[..., Env]:
+def _locate(path: str, key: str) -> Any:
+    """What a dotted path names."""
     module, _, name = path.rpartition(".")
     try:
-        wrapper: Callable[..., Env] = getattr(import_module(module), name)
+        return getattr(import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"there is no env_wrapper {path!r}: {error}") from error
-    return wrapper
+        raise ValueError(f"there is no {key} {path!r}: {error}") from error
 
 
 def hyperparameter(text: str) -> tuple[str, Any]:

@@ -25,6 +25,7 @@ from typing import Any
 
 import gymnasium as gym
 import pandas as pd
+from sb3_contrib import TQC
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
@@ -34,6 +35,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 import sb3_have
 from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
+from sb3_have.common.crossq import MultiInputCrossQ
 from sb3_have.common.episodes import leave_interrupts_to_parent
 from sb3_have.common.evaluation import evaluate
 from sb3_have.common.memory import keep_freed_memory
@@ -45,8 +47,17 @@ EVALUATION_SEED = 1_000_000
 
 
 def algorithms() -> dict[str, type[OffPolicyAlgorithm]]:
-    """Algorithms by the ``algo`` of a configuration."""
-    return {"havesac": sb3_have.HAVESAC, "sac": SAC}
+    """Algorithms by name. SB3's SAC is for comparisons outside of ``zoo_configs``, whose ``sac`` is HAVESAC's."""
+    return {"havesac": sb3_have.HAVESAC, "sac": SAC, "tqc": TQC, "crossq": MultiInputCrossQ}
+
+
+def algorithm_of(config: str) -> str:
+    """Name of the algorithm that a configuration is for: "tqc" and "crossq" by their names, HAVESAC else.
+
+    :param config: name or file of the configuration
+    """
+    name = Path(config).stem
+    return name if name in ("tqc", "crossq") else "havesac"
 
 
 def make_training_env(env_id: str, config: Mapping[str, Any], out: Path | None = None) -> VecEnv:
@@ -221,7 +232,7 @@ class Run:
         algorithm = algorithms()[self.algo]
         if checkpoint is None:
             kwargs = model_kwargs(self.config)
-            if self.algo == "sac" and "replay_buffer_class" not in kwargs:  # as HAVESAC has by default
+            if self.algo != "havesac" and "replay_buffer_class" not in kwargs:  # as HAVESAC has by default
                 derived = {"n_stack": stacked_frames(env), "n_steps": kwargs.pop("n_steps", 1)}
                 derived |= {"gamma": kwargs.get("gamma", 0.99)}
                 kwargs["replay_buffer_class"] = ModalityReplayBuffer
@@ -316,7 +327,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Command line of ``python -m sb3_have.train``."""
     parser = argparse.ArgumentParser(prog="python -m sb3_have.train", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--config", default="havesac", help="YAML file, or the name of one in zoo_configs")
-    parser.add_argument("--algo", default="havesac", choices=["havesac", "sac"])
+    parser.add_argument("--algo", choices=list(algorithms()), help="default: by the configuration's name")
     parser.add_argument("--env", default="HighwayVision-v0", help="environment id")
     parser.add_argument(
         "--hyperparams",
@@ -352,7 +363,7 @@ def main(arguments: list[str] | None = None) -> None:
         args.env,
         args.out,
         seed=args.seed,
-        algo=args.algo,
+        algo=args.algo or algorithm_of(args.config),
         eval_freq=args.eval_freq,
         eval_episodes=args.eval_episodes,
         eval_envs=args.eval_envs,

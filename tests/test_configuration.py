@@ -2,17 +2,20 @@
 
 import argparse
 import pickle
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import pytest
+import torch as th
 import yaml
 from fake_drive import CONFIG, ENV_ID
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 
-from sb3_have import train
+from sb3_have import ModalityReplayBuffer, MultiModalPolicy, train
 from sb3_have.common.drivers import RandomDriver
+from sb3_have.common.encoders import ImageEncoder
 from sb3_have.common.evaluation import evaluate_episodes
 from sb3_have.configuration import (
     config_path,
@@ -21,6 +24,7 @@ from sb3_have.configuration import (
     load_config,
     model_kwargs,
 )
+from sb3_have.have.deepmdp import DeepMDP
 from sb3_have.train import Run
 
 #: Ends every episode after two steps.
@@ -67,6 +71,44 @@ def test_constructor_gets_a_copy_of_what_concerns_it() -> None:
     assert set(kwargs) < set(CONFIG)
     kwargs["policy_kwargs"]["net_arch"].append(1)
     assert CONFIG["policy_kwargs"]["net_arch"] == [8]
+
+
+def test_dotted_paths_become_classes() -> None:
+    config = {
+        "policy": "MultiInputPolicy",
+        "replay_buffer_class": "sb3_have.ModalityReplayBuffer",
+        "auxiliary": {"mine": "sb3_have.have.deepmdp.DeepMDP"},
+        "policy_kwargs": {
+            "fusion": "transfuser",
+            "activation_fn": "torch.nn.Tanh",
+            "encoder_classes": {"rgb": "sb3_have.common.encoders.ImageEncoder"},
+            "precision": "a.word",
+        },
+    }
+    untouched = deepcopy(config)
+    assert model_kwargs(config) == {
+        "policy": "MultiInputPolicy",
+        "replay_buffer_class": ModalityReplayBuffer,
+        "auxiliary": {"mine": DeepMDP},
+        "policy_kwargs": {
+            "fusion": "transfuser",
+            "activation_fn": th.nn.Tanh,
+            "encoder_classes": {"rgb": ImageEncoder},
+            "precision": "a.word",
+        },
+    }
+    assert config == untouched
+    assert model_kwargs({"policy": "sb3_have.MultiModalPolicy"}) == {"policy": MultiModalPolicy}
+    assert model_kwargs({"auxiliary": None, "replay_buffer_class": None}) == {
+        "auxiliary": None,
+        "replay_buffer_class": None,
+    }
+
+
+@pytest.mark.parametrize("path", ["sb3_have.Nothing", "no_such_module.Buffer", "ModalityReplayBuffer"])
+def test_wrong_dotted_paths_are_explained(path: str) -> None:
+    with pytest.raises(ValueError, match=f"no replay_buffer_class '{path}'"):
+        model_kwargs({"replay_buffer_class": path})
 
 
 @pytest.mark.parametrize(

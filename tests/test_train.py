@@ -8,6 +8,7 @@ from typing import Any
 import pandas as pd
 import pytest
 import torch as th
+import yaml
 from fake_drive import CONFIG, ENV_ID
 
 import sb3_have
@@ -105,6 +106,32 @@ def test_several_environments(tmp_path: Path) -> None:
     # a step counts two, so 15 is passed at 16
     assert list(pd.read_csv(tmp_path / "evaluation.csv")["step"]) == [16, 30]
     assert len(list(tmp_path.glob("*.monitor.csv"))) == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "more", "algo"),
+    [
+        ("mine", [], "havesac"),
+        ("sac", [], "havesac"),
+        ("tqc", [], "tqc"),
+        ("crossq", [], "crossq"),
+        ("tqc", ["--algo", "sac"], "sac"),
+    ],
+)
+def test_algorithm_of_the_command_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, more: list[str], algo: str
+) -> None:
+    class Enough(Exception):
+        pass
+
+    def trained(run: Run, *args: Any, **kwargs: Any) -> None:
+        assert run.algo == algo
+        raise Enough
+
+    monkeypatch.setattr(Run, "train", trained)
+    (tmp_path / f"{name}.yml").write_text(yaml.safe_dump({ENV_ID: CONFIG}))
+    with pytest.raises(Enough):
+        train.main(["--config", str(tmp_path / f"{name}.yml"), "--env", ENV_ID, "--out", str(tmp_path), *more])
 
 
 def test_shipped_configuration_fits_havesac() -> None:

@@ -55,12 +55,15 @@ def record_episode(
     observation = vec_env.reset()
     info, done, state = vec_env.unwrapped.reset_infos[0], False, None
     weights: list[dict[str, np.ndarray]] = []
+    weigh = getattr(model, "modality_weights", None)
+    if getattr(getattr(model, "critic", None), "value_estimation", None) == "gve":
+        weigh = None  # the global critic alone has no weights
     while not done and len(recording.infos) != max_steps:
         recording.observations.append(queue.observation)
         recording.pictures.append(np.array(queue.render()))
         recording.infos.append(info)
-        if hasattr(model, "modality_weights"):
-            weights.append(model.modality_weights(observation))
+        if weigh is not None:
+            weights.append(weigh(observation))
         if hasattr(model, "read_infos"):
             model.read_infos([info])
         start = np.array([len(recording.infos) == 1])
