@@ -1,0 +1,369 @@
+"""Figures of a benchmark. A method has the same colour, line and place in each; none is drawn by colour alone.
+
+They draw on ``Figure`` objects: a user's pyplot stays untouched. No text is smaller than 9 points.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
+
+from sb3_have.benchmark.reading import DISTANCE, Measure, Results, ordered
+from sb3_have.benchmark.tables import score_table
+from sb3_have.common.evaluation import performance_profile
+from sb3_have.common.plotting import modality_colours
+
+WIDTH = 9.0
+"""Of every figure [inch]."""
+SMALL, MEDIUM = 9, 10
+PER_PANEL = 7
+"""Curves of a panel, the reference not counted: more cannot be told apart."""
+
+
+class Style(NamedTuple):
+    """How a method is drawn."""
+
+    colour: str
+    line: str = "-"
+    marker: str = "o"
+    hatch: str = ""
+
+
+# Okabe and Ito's colours, told apart by colour-blind people too; a method of the same family as another has its colour
+# with another line, marker and hatch.
+STYLES = {
+    "rgb": Style("#D55E00", marker="s"),
+    "event": Style("#0072B2", marker="^"),
+    "depth": Style("#009E73", marker="v"),
+    "sac": Style("#888888", marker="D"),
+    "deepmdp": Style("#56B4E9", marker="P"),
+    "gve": Style("#56B4E9", "--", "p", "///"),
+    "gve-wide": Style("#E69F00", marker="X"),
+    "drq": Style("#888888", "--", "d", "///"),
+    "transfuser": Style("#009E73", "--", ">", "///"),
+    "efnet": Style("#E69F00", "--", "<", "///"),
+    "tqc": Style("#D55E00", "--", "h", "///"),
+    "crossq": Style("#0072B2", "--", "8", "///"),
+    "lve": Style("#CC79A7", marker="*"),
+    "lve-paper": Style("#CC79A7", ":", "1", "..."),
+    "have-paper": Style("#000000", ":", "2", "..."),
+    "have": Style("#000000"),
+    "have-dropout": Style("#000000", "--", "H", "///"),
+}
+SPARE = tuple(Style(colour, "-.", "x", "xxx") for colour in ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00"))
+
+
+def style(method: str) -> Style:
+    """The look of a method; one without its own takes a spare one that depends on its name alone."""
+    return STYLES.get(method) or SPARE[sum(map(ord, method)) % len(SPARE)]
+
+
+def plot_learning_curves(results: Results, reference: str = "have") -> Figure:
+    """Mean over weathers against training steps: a row of panels for every few methods, a column for each measure.
+
+    A line is the mean over seeds, its band reaches from the lowest to the highest of them. Only the seeds that have
+    come as far as their method's furthest count: a mean of other seeds at other steps would jump where no run did.
+
+    :param results: with ``evaluations``
+    :param reference: method drawn in every panel
+    """
+    curves = {method: learning_curves(results["evaluations"], method) for method in results.methods}
+    methods = [method for method, of_method in curves.items() if len(of_method)]
+    others = [method for method in methods if method != reference]
+    groups = [others[i : i + PER_PANEL] for i in range(0, len(others), PER_PANEL)] or [[]]
+    measures = list(reversed(results.measures))
+    figure = Figure(figsize=(WIDTH, 3.6 * len(groups) + 0.2), layout="constrained")
+    axes = figure.subplots(len(groups), len(measures), sharex=True, sharey="col", squeeze=False)
+    for row, group in zip(axes, groups, strict=True):
+        shown = ordered([*group, *([reference] if reference in methods else [])])
+        for axis, measure in zip(row, measures, strict=True):
+            for method in shown:
+                _draw_curve(axis, method, curves[method], measure, method == reference)
+            _draw_drivers(axis, results["drivers"], measure)
+            axis.set(xlabel="training steps", ylabel=f"{measure.label}, mean of weathers")
+            axis.grid(alpha=0.3)
+            axis.set_xlim(left=0)
+            if measure == DISTANCE:
+                axis.set_ylim(bottom=0)
+        handles, labels = row[0].get_legend_handles_labels()
+        row[-1].legend(handles, labels, fontsize=SMALL, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    return figure
+
+
+def learning_curves(evaluations: pd.DataFrame, method: str) -> pd.DataFrame:
+    """The curve of each seed of a method that has come as far as its furthest.
+
+    :param evaluations: of all methods
+    :return: a row for each seed and step, ``seed``, ``step``, ``return_mean``, ``distance_mean``: means over weathers,
+        of the steps that all of these seeds have in every weather
+    """
+    own = evaluations[evaluations["method"] == method]
+    count = own.groupby(["seed", "step"])["weather"].transform("nunique")
+    own = own[count == evaluations["weather"].nunique()]
+    furthest = own.groupby("seed")["step"].transform("max") == own["step"].max()
+    own = own[furthest]
+    seeds = own.groupby("step")["seed"].transform("nunique")
+    own = own[seeds == own["seed"].nunique()]
+    return pd.DataFrame(own.groupby(["seed", "step"], as_index=False)[["return_mean", "distance_mean"]].mean())
+
+
+def _draw_curve(axis: Axes, method: str, curves: pd.DataFrame, measure: Measure, emphasis: bool) -> None:
+    by_step = curves.groupby("step")[f"{measure.name}_mean"]
+    mean, lowest, highest = by_step.mean(), by_step.min(), by_step.max()
+    look, seeds = style(method), curves["seed"].nunique()
+    axis.plot(
+        mean.index,
+        mean,
+        color=look.colour,
+        linestyle=look.line,
+        marker=look.marker,
+        markersize=5,
+        linewidth=2.5 if emphasis else 1.5,
+        zorder=3 if emphasis else 2,
+        label=f"{method} ({seeds})",
+    )
+    if seeds > 1:
+        axis.fill_between(mean.index, lowest, highest, color=look.colour, alpha=0.13, linewidth=0)
+
+
+def _draw_drivers(axis: Axes, drivers: pd.DataFrame, measure: Measure) -> None:
+    """Levels of the drivers that did not learn."""
+    means = drivers.groupby("driver", sort=False)[f"{measure.name}_mean"].mean()
+    for (driver, level), line in zip(means.items(), ("--", ":", "-.") * len(means), strict=False):
+        axis.axhline(float(level), color="0.35", linestyle=line, linewidth=1, label=str(driver), zorder=1)
+
+
+def plot_scores(results: Results, reference: str = "have", table: pd.DataFrame | None = None) -> Figure:
+    """Interquartile mean of each method over seeds and weathers, with its 95% interval where there are several seeds.
+
+    :param results: with finished runs
+    :param reference: as for :func:`~sb3_have.benchmark.tables.score_table`
+    :param table: its result, where it is known already
+    """
+    table = score_table(results, reference) if table is None else table
+    return _plot_intervals(results, table, "iqm", results.scored(), "IQM of {}")
+
+
+def plot_improvement(results: Results, reference: str = "have", table: pd.DataFrame | None = None) -> Figure:
+    """How often a run of the reference does better than one of each other method in the same weather.
+
+    :raises ValueError: if the reference has no finished run, or nothing else has
+    """
+    others = [method for method in results.scored() if method != reference]
+    if not others or len(others) == len(results.scored()):
+        raise ValueError(f"need finished runs of {reference!r} and of another method, got {results.scored()}")
+    table = score_table(results, reference) if table is None else table
+    figure = _plot_intervals(results, table, "improvement", others, f"P({reference} is better) in {{}}")
+    for axis in figure.axes:
+        axis.axvline(0.5, color="0.35", linestyle="--", linewidth=1, zorder=1)
+        axis.set_xlim(-0.03, 1.03)
+    return figure
+
+
+def _plot_intervals(results: Results, table: pd.DataFrame, name: str, methods: list[str], label: str) -> Figure:
+    """A dot for each method, hollow where it has no interval; the first method on top."""
+    measures = list(reversed(results.measures))
+    figure = Figure(figsize=(WIDTH, 1.1 + 0.3 * len(methods)), layout="constrained")
+    axes = figure.subplots(1, len(measures), sharey=True, squeeze=False)[0]
+    seeds = {method: len(results.finished_seeds(method)) for method in methods}
+    for axis, measure in zip(axes, measures, strict=True):
+        rows = {row["method"]: row for row in table[table["measure"] == measure.name].to_dict("records")}
+        for place, method in enumerate(methods):
+            value, lower, upper = (rows[method][f"{name}{end}"] for end in ("", "_lower", "_upper"))
+            look, known = style(method), bool(np.isfinite(lower))
+            if known:
+                axis.plot([lower, upper], [place, place], color=look.colour, linewidth=5, alpha=0.45)
+            face = look.colour if known else "white"
+            axis.plot(value, place, look.marker, color=look.colour, markerfacecolor=face, markersize=8)
+        axis.set_xlabel(label.format(measure.label))
+        axis.set_yticks(range(len(methods)), [f"{method} ({seeds[method]})" for method in methods])
+        axis.set_ylim(len(methods) - 0.4, -0.6)
+        axis.grid(axis="x", alpha=0.3)
+    return figure
+
+
+def plot_profiles(results: Results, measure: Measure = DISTANCE, reference: str = "have") -> Figure:
+    """Share of runs, over all weathers, whose mean exceeds a threshold: the higher the line, the better.
+
+    :param measure: of the thresholds
+    :param reference: method drawn in every panel
+    """
+    methods = results.scored()
+    scores = {method: results.scores(method, measure) for method in methods}
+    highest = max(float(table.max()) for table in scores.values())
+    lowest = min(0.0, *(float(table.min()) for table in scores.values()))
+    thresholds = np.linspace(lowest, highest, 201)
+    others = [method for method in methods if method != reference]
+    groups = [others[i : i + PER_PANEL] for i in range(0, len(others), PER_PANEL)] or [[]]
+    figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
+    axes = figure.subplots(1, len(groups), sharex=True, sharey=True, squeeze=False)[0]
+    for axis, group in zip(axes, groups, strict=True):
+        for method in ordered([*group, *([reference] if reference in methods else [])]):
+            look = style(method)
+            profile = performance_profile(scores[method], thresholds)
+            width = 2.5 if method == reference else 1.5
+            axis.plot(thresholds, profile, color=look.colour, linestyle=look.line, linewidth=width, label=method)
+        axis.set(xlabel=f"threshold of {measure.label}", ylim=(-0.03, 1.03))
+        axis.grid(alpha=0.3)
+        if len(groups) == 1:
+            axis.legend(fontsize=SMALL, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+        else:
+            axis.legend(fontsize=SMALL, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, frameon=False)
+    axes[0].set_ylabel("share of runs above it")
+    return figure
+
+
+def weather_weights(weights: pd.DataFrame) -> pd.DataFrame:
+    """Mean weight of each modality over the episodes of a weather.
+
+    :param weights: as in ``weights.csv``
+    :return: a row for each method, weather and modality: ``mean``, ``lowest`` and ``highest`` of the ``seeds``
+    """
+    keys = ["method", "weather", "modality"]
+    of_seeds = weights.groupby([*keys, "seed"], sort=False)["weight"].mean()
+    grouped = of_seeds.groupby(level=keys, sort=False)
+    return grouped.agg(mean="mean", lowest="min", highest="max", seeds="count").reset_index()
+
+
+def plot_weather_weights(results: Results) -> Figure:
+    """Mean weight of each modality by weather: a row for each method; whiskers from the lowest to the highest seed.
+
+    :param results: with ``weights``
+    """
+    table = weather_weights(results["weights"])
+    methods = ordered(set(table["method"]))
+    weathers = [weather for weather in results.weathers if weather in set(table["weather"])]
+    weathers = weathers or list(dict.fromkeys(table["weather"]))
+    colours = modality_colours(list(dict.fromkeys(table["modality"])))
+    figure = Figure(figsize=(WIDTH, 1.9 * len(methods) + 1.0), layout="constrained")
+    axes = figure.subplots(len(methods), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    width = 0.8 / len(colours)
+    for axis, method in zip(axes, methods, strict=True):
+        rows = table[table["method"] == method].set_index(["modality", "weather"])
+        for number, (modality, colour) in enumerate(colours.items()):
+            known = [weather for weather in weathers if (modality, weather) in rows.index]
+            if not known:
+                continue
+            places = [weathers.index(weather) + (number - (len(colours) - 1) / 2) * width for weather in known]
+            shown = rows.loc[[(modality, weather) for weather in known]]
+            axis.bar(places, shown["mean"], 0.92 * width, color=colour, label=modality)
+            if shown["seeds"].max() > 1:
+                _draw_whiskers(axis, places, shown["lowest"], shown["highest"])
+        seeds = sorted(set(results["weights"].loc[results["weights"]["method"] == method, "seed"]))
+        axis.set_title(f"{method}, {_seeds(seeds)}", fontsize=MEDIUM)
+        axis.axhline(1 / len(colours), color="0.35", linestyle=":", linewidth=1, label="equal weights")
+        axis.set(ylabel="weight", ylim=(0, 1))
+        axis.grid(axis="y", alpha=0.3)
+    axes[-1].set_xticks(range(len(weathers)), [_broken(weather) for weather in weathers], fontsize=SMALL)
+    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=SMALL, loc="outside upper center", ncols=6)
+    return figure
+
+
+def plot_episode_weights(results: Results, method: str, seed: int) -> Figure:
+    """Weight of each modality over one episode of each weather (the paper's Fig. 5).
+
+    :param results: with ``weights``
+    :param method: that has weights
+    :param seed: of the run
+    :raises ValueError: if the run has no weights
+    """
+    weights = results["weights"]
+    weights = weights[(weights["method"] == method) & (weights["seed"] == seed)]
+    driven = results["episodes"]
+    driven = driven[(driven["method"] == method) & (driven["seed"] == seed)]
+    if weights.empty:
+        raise ValueError(f"weights.csv has no weights of {method!r} with seed {seed}")
+    weathers = [weather for weather in results.weathers if weather in set(weights["weather"])]
+    weathers = weathers or list(dict.fromkeys(weights["weather"]))
+    colours = modality_colours(list(dict.fromkeys(weights["modality"])))
+    columns = min(4, len(weathers))
+    rows = -(-len(weathers) // columns)
+    figure = Figure(figsize=(WIDTH, 1.9 * rows + 0.8), layout="constrained")
+    axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
+    for axis, weather in zip(axes.flat, weathers, strict=False):
+        of_weather = weights[weights["weather"] == weather]
+        episode = of_weather[of_weather["episode_seed"] == of_weather["episode_seed"].iloc[0]]
+        for modality, colour in colours.items():
+            line = episode[episode["modality"] == modality].sort_values("t")
+            axis.plot(line["t"], line["weight"], color=colour, linewidth=1.2, label=modality)
+        ended = driven[(driven["weather"] == weather) & (driven["episode_seed"] == episode["episode_seed"].iloc[0])]
+        told = f", return {ended['return'].iloc[0]:.0f}" if len(ended) else ""
+        axis.set_title(f"{weather}{told}", fontsize=SMALL)
+        axis.set_ylim(0, 1)
+        axis.grid(alpha=0.3)
+    for axis in axes.flat[len(weathers) :]:
+        axis.set_visible(False)
+    figure.supxlabel("step of the episode", fontsize=MEDIUM)
+    figure.supylabel("weight", fontsize=MEDIUM)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), fontsize=SMALL, loc="outside upper center", ncols=6)
+    return figure
+
+
+def plot_kept(table: pd.DataFrame, measure: Measure) -> Figure:
+    """What every method keeps when a sensor fails: a row for each modality, a group of bars for each kind of failure.
+
+    :param table: from :func:`~sb3_have.benchmark.tables.kept_table`
+    :param measure: what is kept
+    """
+    modalities = list(modality_colours(list(set(table["modality"]))))
+    methods = ordered(set(table["method"]))
+    figure = Figure(figsize=(WIDTH, 2.3 * len(modalities) + 0.9), layout="constrained")
+    axes = figure.subplots(len(modalities), 1, sharey=True, squeeze=False)[:, 0]
+    width, handles = 0.84 / len(methods), {}
+    for axis, modality in zip(axes, modalities, strict=True):
+        rows = table[table["modality"] == modality]
+        cases = list(dict.fromkeys(zip(rows["kind"], rows["severity"], strict=True)))
+        for number, method in enumerate(methods):
+            shares = _shares(rows[rows["method"] == method], measure)
+            known = [case for case in cases if case in shares and np.isfinite(shares[case]["kept"])]
+            places = [cases.index(case) + (number - (len(methods) - 1) / 2) * width for case in known]
+            if not known:
+                continue
+            look = style(method)
+            heights = [shares[case]["kept"] for case in known]
+            bars = axis.bar(
+                places, heights, 0.9 * width, color=look.colour, hatch=look.hatch, edgecolor="white", linewidth=0.5
+            )
+            handles[method] = bars
+            if max(shares[case]["seeds"] for case in known) > 1:
+                lowest, highest = ([shares[case][name] for case in known] for name in ("lowest", "highest"))
+                _draw_whiskers(axis, places, lowest, highest)
+        labels = [f"{kind} {severity}" if len(set(rows["severity"])) > 1 else kind for kind, severity in cases]
+        axis.set_xticks(range(len(cases)), labels)
+        axis.set_title(f"{modality} fails", fontsize=MEDIUM)
+        axis.axhline(1.0, color="0.35", linestyle="--", linewidth=1)
+        axis.set_ylabel(f"{measure.name} kept")
+        axis.grid(axis="y", alpha=0.3)
+    shown = {method: handles[method] for method in methods if method in handles}
+    figure.legend(shown.values(), shown.keys(), fontsize=SMALL, loc="outside upper center", ncols=6)
+    return figure
+
+
+def _shares(rows: pd.DataFrame, measure: Measure) -> Mapping[tuple[str, int], dict[str, Any]]:
+    names = ("kept", "lowest", "highest", "seeds")
+    return {
+        (row["kind"], row["severity"]): {name: row[f"{measure.name}_{name}"] for name in names}
+        for row in rows.to_dict("records")
+    }
+
+
+def _draw_whiskers(axis: Axes, places: Sequence[float], lowest: ArrayLike, highest: ArrayLike) -> None:
+    axis.vlines(places, lowest, highest, color="0.3", linewidth=1.2, zorder=3)
+
+
+def _seeds(seeds: Sequence[int]) -> str:
+    return f"seed {seeds[0]}" if len(seeds) == 1 else f"mean of seeds {', '.join(map(str, seeds))}"
+
+
+def _broken(weather: str) -> str:
+    """``HardRainNight`` on two lines."""
+    for end in ("Noon", "Night"):
+        if weather.endswith(end):
+            return f"{weather.removesuffix(end)}\n{end}"
+    return weather

@@ -1,0 +1,364 @@
+"""The report of a benchmark: ``report.md``, its figures, and its tables as CSV files, from the results of the runs.
+
+    python -m sb3_have.benchmark report benchmarks/results/core --out benchmarks/results/core/report
+
+Several folders are joined, such as those of a grid and of its extension. A benchmark that is half done gives a report
+of what there is, and says what is missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from matplotlib.figure import Figure
+
+from sb3_have.benchmark import figures, tables
+from sb3_have.benchmark.reading import RETURN, Measure, Results, ResultsError, ordered, read_results
+
+DPI = 110
+INTERVALS = (
+    "Intervals are 95% percentile intervals of a stratified bootstrap (2,000 resamples): within each weather, seeds "
+    "are drawn anew. With few seeds they are narrower than they should be, the more so as a seed that is good in one "
+    "weather tends to be good in all, which the bootstrap does not know."
+)
+
+
+def write_report(results: Path | Sequence[Path], out: Path, reference: str = "have") -> Path:
+    """Read results and write the report.
+
+    :param results: folder or folders
+    :param out: folder of the report; made if need be
+    :param reference: method that is compared with each of the others
+    :return: path of ``report.md``
+    :raises ResultsError: if results are missing or broken
+    """
+    folders = [results] if isinstance(results, Path) else list(results)
+    return Report(read_results(folders), out, reference).write()
+
+
+class Report:
+    """Writes the parts of a report.
+
+    :param results: to report
+    :param out: folder
+    :param reference: method that is compared with each of the others
+    """
+
+    def __init__(self, results: Results, out: Path, reference: str = "have") -> None:
+        self.results, self.out, self.reference = results, Path(out), reference
+        self.methods = results.scored()
+
+    def write(self) -> Path:
+        """All parts, and the files beside them.
+
+        :return: path of ``report.md``
+        """
+        self.out.mkdir(parents=True, exist_ok=True)
+        names = ", ".join(folder.resolve().name for folder in self.results.folders)
+        parts = [f"# Benchmark: {names}", *self._runs()]
+        if self.methods:
+            self.weather_table = tables.weather_table(self.results)
+            self.scores = tables.score_table(self.results, self.reference)
+            parts += [*self._summary(), *self._weathers(), *self._ablation(), *self._statistics(), *self._ends()]
+        parts += [*self._curves(), *self._weights(), *self._failures(), *self._provenance()]
+        path = self.out / "report.md"
+        path.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
+        return path
+
+    def _runs(self) -> list[str]:
+        table = tables.run_table(self.results)
+        parts = ["## Runs", tables.run_markdown(table)]
+        if not self.methods:
+            parts.append("No run is finished yet: there are no tables and statistics, only learning curves.")
+        return [*parts, *missing(self.results, table)]
+
+    def _summary(self) -> list[str]:
+        lines = [] if self.reference in self.methods else [f"`{self.reference}` has no finished run."]
+        for measure in reversed(self.results.measures):
+            lines += _standing(self.weather_table, measure, self.reference, self.results.weathers)
+            lines += _improvements(self.scores, measure, self.reference)
+        return ["## In short", "\n".join(f"- {line}" for line in lines)]
+
+    def _weathers(self) -> list[str]:
+        table = self.weather_table
+        self._save_table("weathers", table)
+        weathers = len(self.results.weathers)
+        caption = (
+            "ER is the return of an episode (episode reward), D the distance driven in it. Mean over seeds and "
+            "episodes of the final evaluation with the deterministic policy; number of seeds in brackets. ± is the "
+            "standard deviation of the seeds' means (ddof 1)"
+        )
+        single = [name for name in self.methods if len(self.results.finished_seeds(name)) == 1]
+        if single:
+            caption += f", but for {_listed(single)}, with a single seed, that of the episodes"
+        if len(self.results["drivers"]):
+            names = list(dict.fromkeys(self.results["drivers"]["driver"]))
+            caption += f"; {_listed(names)} did not learn, and ± is over episodes"
+        caption += f'. "{tables.ALL}" is the mean over the {weathers} weathers. The best mean of the methods is bold, '
+        caption += "which says nothing about chance: see the intervals below. Numbers: `table_weathers.csv`."
+        return ["## Table 1: every method in every weather", tables.weather_markdown(self.results, table), caption]
+
+    def _ablation(self) -> list[str]:
+        table = tables.ablation_table(self.results)
+        if len(table) < 2:
+            return ["## Table 2: the parts of HAVE", f"Needs finished runs of two of {_listed(tables.ABLATION)}."]
+        self._save_table("ablation", table)
+        absent = [name for name in tables.ABLATION if name not in set(table["method"]) and name != "gve"]
+        caption = "Over all weathers; mean and ± as in Table 1. Parameters are those of the whole model."
+        caption += f" Without a finished run: {_listed(absent)}." if absent else ""
+        caption += " Numbers: `table_ablation.csv`."
+        return ["## Table 2: the parts of HAVE", tables.ablation_markdown(self.results, table), caption]
+
+    def _statistics(self) -> list[str]:
+        self._save_table("statistics", self.scores)
+        parts = ["## All weathers together"]
+        for measure in reversed(self.results.measures):
+            parts.append(tables.score_markdown(self.scores, measure, self.reference))
+        single = [name for name in self.methods if len(self.results.finished_seeds(name)) == 1]
+        caption = (
+            "A score is the mean over the episodes of a seed in a weather. IQM: mean of the scores of all seeds and "
+            "weathers without the lowest and the highest quarter. "
+            f"P({self.reference} is better): how often a run of `{self.reference}` has the higher score than one of "
+            f"the other method in the same weather, ties counting half. {INTERVALS}"
+        )
+        if single:
+            caption += f" {_listed(single)}: a single seed, hence no interval (hollow markers)."
+        parts += [f"{caption} Numbers: `table_statistics.csv`."]
+        parts.append(
+            self._figure("iqm", figures.plot_scores(self.results, self.reference, self.scores), "IQM by method")
+        )
+        if self.reference in self.methods and len(self.methods) > 1:
+            figure = figures.plot_improvement(self.results, self.reference, self.scores)
+            parts.append(self._figure("improvement", figure, f"Probability that {self.reference} is better"))
+        for measure in self.results.measures[-1:]:
+            figure = figures.plot_profiles(self.results, measure, self.reference)
+            parts.append(self._figure("profiles", figure, f"Performance profiles of {measure.name}"))
+            parts.append(
+                f"Performance profiles: share of scores above a threshold of {measure.name}. Drawn without intervals."
+            )
+        return parts
+
+    def _ends(self) -> list[str]:
+        table = tables.end_table(self.results)
+        if table.empty:
+            return []
+        return ["## How episodes end", tables.end_markdown(table), "Shares of the final evaluation's episodes."]
+
+    def _curves(self) -> list[str]:
+        if self.results["evaluations"].empty:
+            return []
+        figure = figures.plot_learning_curves(self.results, self.reference)
+        caption = (
+            "Mean over weathers of the evaluations while training. Line: mean over seeds; band: from the lowest to the "
+            "highest seed (no band for a single one). Number of seeds in brackets: of a method, only the seeds that "
+            "have come as far as its furthest count."
+        )
+        return ["## Learning curves", self._figure("learning_curves", figure, "Learning curves"), caption]
+
+    def _weights(self) -> list[str]:
+        weights = self.results["weights"]
+        if weights.empty:
+            return []
+        self._save_table("weights", figures.weather_weights(weights))
+        parts = ["## Weights of the modalities"]
+        figure = figures.plot_weather_weights(self.results)
+        parts.append(self._figure("weights_by_weather", figure, "Weight of each modality by weather"))
+        parts.append(
+            "Mean weight over one episode in each weather. Bars: mean over seeds; whiskers: from the lowest to the "
+            "highest seed. Dotted: equal weights. Numbers: `table_weights.csv`."
+        )
+        weighing = ordered(set(weights["method"]))
+        method = self.reference if self.reference in weighing else weighing[0]
+        seed = int(weights.loc[weights["method"] == method, "seed"].min())
+        figure = figures.plot_episode_weights(self.results, method, seed)
+        parts.append(self._figure("weights_in_episode", figure, "Weights over an episode"))
+        parts.append(f"Weights over one episode of each weather: `{method}`, seed {seed}, deterministic policy.")
+        return parts
+
+    def _failures(self) -> list[str]:
+        table = tables.kept_table(self.results)
+        if table.empty:
+            return []
+        self._save_table("failures", table)
+        parts = ["## When a sensor fails"]
+        episodes = sorted(set(self.results["failures"]["episodes"]))
+        severity = sorted(set(table["severity"]))
+        for measure in self.results.measures:
+            name = "failures" if measure == RETURN else f"failures_{measure.name}"
+            figure = figures.plot_kept(table, measure)
+            parts += [f"Share of the {measure.name} kept:", tables.kept_markdown(table, measure)]
+            parts.append(self._figure(name, figure, f"Share of the {measure.name} kept under sensor failures"))
+        caption = (
+            f"A sensor fails for whole episodes, at severity {_listed(map(str, severity))} (episodes in each weather: "
+            f"{_listed(map(str, episodes))}). Share: mean over the weathers with the failure over that without, in the "
+            "same episodes; bars and table: mean of the seeds' shares; whiskers: from the lowest to the highest seed. "
+            "A share of a poor driver is easily high: read it beside Table 1. Numbers: `table_failures.csv`."
+        )
+        parts.append(caption)
+        seeds = self.results["failures"].groupby("method")["seed"].nunique()
+        left_out = [
+            f"{row['method']} ({row['modality']} {row['kind']})"
+            for row in table.to_dict("records")
+            if row["return_seeds"] < seeds[row["method"]]
+        ]
+        if left_out:
+            parts.append(
+                "Left out of the share of the return, because a seed's healthy mean is not positive or there is none "
+                f"with the failure: {_listed(left_out)}."
+            )
+        return parts
+
+    def _provenance(self) -> list[str]:
+        return ["## Provenance", *provenance(self.results, self.out)]
+
+    def _save_table(self, name: str, table: pd.DataFrame) -> None:
+        table.round(4).to_csv(self.out / f"table_{name}.csv", index=False)
+
+    def _figure(self, name: str, figure: Figure, text: str) -> str:
+        # no version of matplotlib in the file: the same results give the same bytes
+        figure.savefig(self.out / f"{name}.png", dpi=DPI, metadata={"Software": None})
+        return f"![{text}]({name}.png)"
+
+
+def missing(results: Results, table: pd.DataFrame) -> list[str]:
+    """What a report has to say about runs that are not there.
+
+    :param table: from :func:`~sb3_have.benchmark.tables.run_table`
+    """
+    lines = []
+    for row in table.to_dict("records"):
+        absent = [f"{label} {row[name]}" for name, label in _ABSENCE.items() if row[name]]
+        lines += [f"`{row['method']}`: seed " + "; seed ".join(absent)] if absent else []
+    parts = []
+    if lines:
+        parts.append("Missing, if every method is to have every seed:\n\n" + "\n".join(f"- {line}" for line in lines))
+    elif len(table):
+        parts.append("Every method has every seed.")
+    lengths = sorted(set(results.finished["step"]))
+    if len(lengths) > 1:
+        parts.append(
+            f"**Runs of different length are side by side**: {_listed(f'{step:,}' for step in lengths)} steps."
+        )
+    return parts
+
+
+_ABSENCE = {"under_way": "under way:", "not_begun": "not begun:"}
+
+
+def _standing(table: pd.DataFrame, measure: Measure, reference: str, weathers: Sequence[str]) -> list[str]:
+    """Where the reference stands, in sentences."""
+    table = table[table["measure"] == measure.name]
+    overall = table[(table["weather"] == tables.ALL) & (table["seeds"] > 0)].sort_values("mean", ascending=False)
+    unit = f" {measure.unit}" if measure.unit else ""
+    levels = [f"`{r['driver']}` {r['mean']:.{measure.digits}f}{unit}" for r in overall.to_dict("records")]
+    lines = [f"Mean {measure.name} over the weathers, best first: {', '.join(levels)}."]
+    best = table[table["best"] & (table["weather"] != tables.ALL)]
+    won = best.loc[best["driver"] == reference, "weather"]
+    others = best[~best["weather"].isin(won)]
+    if reference in set(table["driver"]):
+        text = f"`{reference}` is first in {measure.name} in {len(won)} of {len(weathers)} weathers"
+        told = [f"{row['weather']} (`{row['driver']}`)" for row in others.to_dict("records")]
+        lines.append(f"{text}; not in {_listed(told)}." if told else f"{text}.")
+    return lines
+
+
+def _improvements(scores: pd.DataFrame, measure: Measure, reference: str) -> list[str]:
+    """Over which methods the reference is better by more than chance, in sentences."""
+    rows = scores[(scores["measure"] == measure.name) & scores["improvement"].notna()]
+    if rows.empty:
+        return []
+    unknown = rows["improvement_lower"].isna()
+    groups = {
+        "above 0.5": rows["improvement_lower"] > 0.5,
+        "on both sides of 0.5": (rows["improvement_lower"] <= 0.5) & (rows["improvement_upper"] >= 0.5),
+        "below 0.5": rows["improvement_upper"] < 0.5,
+        "not known for want of seeds": unknown,
+    }
+    told = [
+        f"{label} for {_listed(f'`{name}`' for name in rows.loc[chosen, 'method'])}"
+        for label, chosen in groups.items()
+        if chosen.any()
+    ]
+    return [f"Probability that `{reference}` is better in {measure.name}, its 95% interval: {'; '.join(told)}."]
+
+
+def provenance(results: Results, out: Path) -> list[str]:
+    """On what the runs were made, with which settings, and by which commands.
+
+    :param out: folder of the report
+    """
+    runs, parts = results["runs"], []
+    if runs.empty:
+        parts.append("There is no `runs.csv`: machine, versions and settings are not known.")
+    else:
+        for name, title in (("machine", "Machines"), ("versions", "Versions")):
+            counts = runs[name].value_counts()
+            parts.append(f"{title}:\n\n" + "\n".join(f"- {text} ({n} runs)" for text, n in counts.items()))
+        parts += _settings(runs)
+    commands = [f"python -m sb3_have.benchmark run {folder.resolve().name}.yml" for folder in results.folders]
+    folders = [shlex.quote(_shown(folder)) for folder in results.folders]
+    commands.append(f"python -m sb3_have.benchmark report {' '.join(folders)} --out {shlex.quote(_shown(out))}")
+    return [*parts, "Commands:", "```\n" + "\n".join(commands) + "\n```"]
+
+
+def _settings(runs: pd.DataFrame) -> list[str]:
+    """The settings that all runs share, and by method those that they do not."""
+    of_runs = [flatten(json.loads(text)) for text in runs["settings"]]
+    keys = list(dict.fromkeys(key for settings in of_runs for key in settings))
+    same = [key for key in keys if all(key in s and s[key] == of_runs[0][key] for s in of_runs)]
+    shared = "\n".join(f"{key}: {json.dumps(of_runs[0][key])}" for key in same)
+    parts = ["Settings of all runs:", f"```yaml\n{shared}\n```"] if same else []
+    rows = []
+    for method in ordered(set(runs["method"])):
+        own = [settings for settings, name in zip(of_runs, runs["method"], strict=True) if name == method]
+        for key in (key for key in keys if key not in same):
+            values = list(dict.fromkeys(json.dumps(settings[key]) for settings in own if key in settings))
+            if values:
+                rows.append([method, key, " or ".join(values)])
+    if rows:
+        parts += ["Settings of a method:", tables.markdown(["method", "setting", "value"], rows)]
+    return parts
+
+
+def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested settings by dotted names: ``{"a": {"b": 1}}`` is ``{"a.b": 1}``."""
+    flat: dict[str, Any] = {}
+    for key, value in settings.items():
+        if isinstance(value, Mapping) and value:
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = value
+    return flat
+
+
+def _shown(path: Path) -> str:
+    """A path relative to the working directory where it lies in there."""
+    absolute = path.resolve()
+    return absolute.relative_to(Path.cwd()).as_posix() if absolute.is_relative_to(Path.cwd()) else absolute.as_posix()
+
+
+def _listed(names: Iterable[str]) -> str:
+    """``a``, ``a and b``, ``a, b and c``."""
+    *most, last = list(names)
+    return f"{', '.join(most)} and {last}" if most else last
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Command line of ``python -m sb3_have.benchmark report``."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_have.benchmark report", description=(__doc__ or "").splitlines()[0]
+    )
+    parser.add_argument("results", nargs="+", type=Path, help="folders with the CSV files of a benchmark; joined")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the report")
+    parser.add_argument("--reference", default="have", help="method to compare with each of the others")
+    args = parser.parse_args(arguments)
+    try:
+        print(write_report(args.results, args.out, args.reference))
+    except ResultsError as error:
+        raise SystemExit(str(error)) from None
