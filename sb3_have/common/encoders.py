@@ -3,17 +3,19 @@
 from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 import torch as th
 import torch.nn.functional as F
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
+
+from sb3_have.common.fusion import encode_fused, make_fusions
+from sb3_have.common.modalities import Modality, check_known, make_modality
 
 EVENT_SCALE = 1 / 8  # one event is 0.125, about the contrast of a clearly visible edge in an image scaled to [0, 1]
 PRECISIONS = ("auto", "float32", "bfloat16")
@@ -52,7 +54,15 @@ class ImageEncoder(nn.Module):
         self.to(memory_format=th.channels_last)  # type: ignore[call-overload]
 
     def forward(self, observations: th.Tensor) -> th.Tensor:
-        maps = self.convolutions(observations.contiguous(memory_format=th.channels_last))
+        return self.features(self.convolutions(observations.contiguous(memory_format=th.channels_last)))
+
+    @property
+    def stages(self) -> list[nn.Module]:
+        """Each convolution with its ReLU, for a fusion to come between them."""
+        return [self.convolutions[i : i + 2] for i in range(0, len(self.convolutions), 2)]
+
+    def features(self, maps: th.Tensor) -> th.Tensor:
+        """(batch, features_dim) of the maps after the last stage."""
         features: th.Tensor = self.output(maps.permute(0, 2, 3, 1).flatten(start_dim=1))  # a view, not a copy
         return features
 
@@ -91,14 +101,6 @@ class VectorEncoder(nn.Module):
         return features
 
 
-class Modality(NamedTuple):
-    """One group of observation keys that share an encoder."""
-
-    keys: tuple[str, ...]
-    space: spaces.Box
-    is_image: bool
-
-
 class MultiModalEncoder(nn.Module):
     """
     One encoder per modality: z_i = Enc_i(o_i), stacked to (batch, d, features_dim).
@@ -119,6 +121,10 @@ class MultiModalEncoder(nn.Module):
     :param normalize_images: whether to decode images as above
     :param precision: of the image encoders' arithmetic: "float32", "bfloat16" (features and weights stay float32), or
         "auto", bfloat16 where the hardware multiplies it natively (CPU with AMX, CUDA from sm80 on)
+    :param fusion: what mixes the modalities' feature maps: "concat", nothing (features are concatenated later on),
+        "transfuser", "efnet", or an own class, see :mod:`sb3_have.common.fusion`; the modalities must all be images
+    :param fusion_kwargs: ``stages`` ("last" by default, "all", or numbers from 0 on), the convolutions it comes after,
+        each time with parameters of its own; the others are its keyword arguments
     :raises ValueError: for a space, key or modality that cannot be encoded; the message names it and the remedy
     """
 
@@ -132,6 +138,8 @@ class MultiModalEncoder(nn.Module):
         signed_keys: Sequence[str] | None = None,
         normalize_images: bool = True,
         precision: str = "auto",
+        fusion: str | type[nn.Module] = "concat",
+        fusion_kwargs: Mapping[str, Any] | None = None,
     ):
         super().__init__()
         if precision not in PRECISIONS:
@@ -142,17 +150,17 @@ class MultiModalEncoder(nn.Module):
         if modalities is None:
             modalities = {key: [key] for key in keys}
         self.modalities = {
-            name: _make_modality(name, group, observation_space, normalize_images) for name, group in modalities.items()
+            name: make_modality(name, group, observation_space, normalize_images) for name, group in modalities.items()
         }
         if not self.modalities:
             raise ValueError("`modalities` is empty: name at least one modality and its observation keys.")
         encoder_classes, encoder_kwargs = encoder_classes or {}, encoder_kwargs or {}
-        _check_known("encoder_classes", encoder_classes, self.modalities)
-        _check_known("encoder_kwargs", encoder_kwargs, self.modalities)
+        check_known("encoder_classes", encoder_classes, self.modalities)
+        check_known("encoder_kwargs", encoder_kwargs, self.modalities)
         if signed_keys is None:
             signed_keys = [key for key in keys if "event" in key]
         else:
-            _check_known(
+            check_known(
                 "signed_keys", signed_keys, [key for key in keys if len(observation_space[key].shape or ()) == 3]
             )
         self.features_dim = features_dim
@@ -166,31 +174,48 @@ class MultiModalEncoder(nn.Module):
             self.encoders.append(
                 encoder_class(modality.space, features_dim=features_dim, **encoder_kwargs.get(name, {}))
             )
+        self.fusions = nn.ModuleDict()
+        if fusion != "concat":
+            encoders = dict(zip(self.modalities, self.encoders, strict=True))
+            shapes = {name: modality.space.shape for name, modality in self.modalities.items()}
+            self.fusions = make_fusions(fusion, encoders, shapes, **(fusion_kwargs or {}))
+        elif fusion_kwargs:
+            raise ValueError(
+                f'fusion="concat" takes no fusion_kwargs, got {fusion_kwargs}; name the fusion they are for.'
+            )
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
         if not isinstance(observations, dict):
             observations = {"observation": observations}
-        features = []
-        for encoder, (name, modality) in zip(self.encoders, self.modalities.items(), strict=True):
-            observation = observations[modality.keys[0]]
-            dtype = self.image_dtype(observation.device) if modality.is_image else th.float32
-            decoded = [self._decode(key, observations[key], modality.is_image, dtype) for key in modality.keys]
-            inputs = decoded[0] if len(decoded) == 1 else th.cat(decoded, dim=1)
-            with th.autocast(observation.device.type, dtype=dtype, enabled=dtype != th.float32):
-                encoded = encoder(inputs)
-            expected = (inputs.shape[0], self.features_dim)
-            if encoded.shape != expected:
+        if self.fusions:
+            images = [self._inputs(modality, observations) for modality in self.modalities.values()]
+            with _autocast(images[0]):
+                encoded = encode_fused(list(self.encoders), self.fusions, images)
+        else:
+            encoded = []
+            for encoder, modality in zip(self.encoders, self.modalities.values(), strict=True):
+                inputs = self._inputs(modality, observations)
+                with _autocast(inputs):
+                    encoded.append(encoder(inputs))
+        for (name, modality), encoder, features in zip(self.modalities.items(), self.encoders, encoded, strict=True):
+            expected = (observations[modality.keys[0]].shape[0], self.features_dim)
+            if features.shape != expected:
                 raise ValueError(
-                    f"modality {name!r}: {type(encoder).__name__} gave features of shape {tuple(encoded.shape)}, "
+                    f"modality {name!r}: {type(encoder).__name__} gave features of shape {tuple(features.shape)}, "
                     f"expected {expected}; let it end in the `features_dim` units it is given."
                 )
-            features.append(encoded.float())
-        return th.stack(features, dim=1)
+        return th.stack([features.float() for features in encoded], dim=1)
 
     def image_dtype(self, device: th.device) -> th.dtype:
         """The arithmetic of the image encoders on ``device``."""
         bfloat16 = self.precision == "bfloat16" or (self.precision == "auto" and has_native_bfloat16(device.type))
         return th.bfloat16 if bfloat16 else th.float32
+
+    def _inputs(self, modality: Modality, observations: dict[str, th.Tensor]) -> th.Tensor:
+        """What a modality's encoder reads."""
+        dtype = self.image_dtype(observations[modality.keys[0]].device) if modality.is_image else th.float32
+        decoded = [self._decode(key, observations[key], modality.is_image, dtype) for key in modality.keys]
+        return decoded[0] if len(decoded) == 1 else th.cat(decoded, dim=1)
 
     def _decode(self, key: str, observation: th.Tensor, is_image: bool, dtype: th.dtype) -> th.Tensor:
         if not is_image:
@@ -283,71 +308,14 @@ def _table(signed: bool, dtype: th.dtype) -> np.ndarray:
     return (table.view(th.int16) if dtype == th.bfloat16 else table).numpy()
 
 
+def _autocast(inputs: th.Tensor) -> th.autocast:
+    """Arithmetic of the type of ``inputs``."""
+    return th.autocast(inputs.device.type, dtype=inputs.dtype, enabled=inputs.dtype != th.float32)
+
+
 @th.compiler.assume_constant_result  # type: ignore[untyped-decorator]
 def has_native_bfloat16(device_type: str) -> bool:
     """Whether the hardware multiplies bfloat16 matrices natively: a CPU with AMX, or CUDA from sm80 on."""
     if device_type == "cuda":
         return th.cuda.get_device_capability() >= (8, 0)
     return device_type == "cpu" and th.cpu._is_amx_tile_supported()
-
-
-def _make_modality(name: str, keys: Sequence[str], space: spaces.Dict, normalize_images: bool) -> Modality:
-    """The modality ``name`` made of ``keys``; ValueError if they cannot be encoded together."""
-    if isinstance(keys, str) or not keys:
-        raise ValueError(f"modality {name!r}: expected a non-empty list of observation keys, got {keys!r}.")
-    _check_known(f"modality {name!r}", keys, space.spaces)
-    boxes = [_check_box(key, space[key], normalize_images) for key in keys]
-    is_image = [len(box.shape) == 3 for box in boxes]
-    if len(keys) == 1:
-        return Modality(tuple(keys), boxes[0], is_image[0])
-    shapes = {key: box.shape for key, box in zip(keys, boxes, strict=True)}
-    if all(is_image) and len({shape[1:] for shape in shapes.values()}) == 1:
-        shape = (sum(box.shape[0] for box in boxes), *boxes[0].shape[1:])
-        dtypes = {box.dtype for box in boxes}
-        if dtypes == {np.dtype(np.uint8)}:
-            return Modality(tuple(keys), spaces.Box(0, 255, shape, np.uint8), True)
-        return Modality(tuple(keys), spaces.Box(-np.inf, np.inf, shape, np.float32), True)
-    if not any(is_image):
-        size = sum(int(np.prod(box.shape)) for box in boxes)
-        return Modality(tuple(keys), spaces.Box(-np.inf, np.inf, (size,), np.float32), False)
-    raise ValueError(
-        f"modality {name!r}: its keys must be images of one height and width, or all vectors, got {shapes}; "
-        "make them modalities of their own."
-    )
-
-
-def _check_box(key: str, space: spaces.Space[Any], normalize_images: bool) -> spaces.Box:
-    where = f"observation key {key!r}"
-    if not isinstance(space, spaces.Box):
-        raise ValueError(
-            f"{where}: expected a Box (an image or a vector), got {space}; encode it as numbers, e.g. "
-            "by a wrapper that flattens or one-hot encodes this key (gymnasium.spaces.utils.flatten)."
-        )
-    if len(space.shape) == 2 and space.dtype == np.uint8:
-        raise ValueError(
-            f"{where}: expected an image (H, W, C) or a vector, got {space.dtype} of shape {space.shape}; give a grey "
-            "image a channel axis (gymnasium.wrappers.ReshapeObservation, or image[..., None])."
-        )
-    if len(space.shape) != 3:
-        return space
-    if normalize_images and not is_image_space(space):
-        raise ValueError(
-            f"{where}: expected a uint8 image with bounds 0..255, got {space.dtype} of shape {space.shape} in "
-            f"[{space.low.min()}, {space.high.max()}]; convert it to uint8 (under "
-            "VecNormalize, leave it out of `norm_obs_keys`), or pass "
-            "`policy_kwargs=dict(normalize_images=False)` to feed channel-first images as they are."
-        )
-    if not is_image_space_channels_first(space):
-        raise ValueError(
-            f"{where}: expected a channel-first image (C, H, W), got shape {space.shape}; SB3 transposes uint8 images "
-            "with bounds 0..255 by itself, others have to be transposed by the environment."
-        )
-    return space
-
-
-def _check_known(
-    where: str, names: Sequence[str] | Mapping[str, Any], known: Sequence[str] | Mapping[str, Any]
-) -> None:
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise ValueError(f"{where}: unknown {', '.join(map(repr, unknown))}; known are {', '.join(map(repr, known))}.")

@@ -49,6 +49,9 @@ class MultiModalPolicy(SACPolicy):
     :param encoder_kwargs: keyword arguments of the encoders of some modalities
     :param signed_keys: image keys of signed counts around 128; by default those with "event" in their name
     :param precision: arithmetic of the image encoders: "auto", "float32" or "bfloat16"
+    :param fusion: what mixes feature maps between the encoders: "concat" (nothing), "transfuser", "efnet", or an own
+        class, see :mod:`sb3_have.common.fusion`
+    :param fusion_kwargs: its keyword arguments, and ``stages``, the convolutions it comes after
     :param value_estimation: "have", "lve" or "gve"
     :param refusion: "convex", "monotone" or "free"
     :param attention_dim: p of Eq. 9
@@ -81,6 +84,8 @@ class MultiModalPolicy(SACPolicy):
         encoder_kwargs: Mapping[str, Mapping[str, Any]] | None = None,
         signed_keys: Sequence[str] | None = None,
         precision: str = "auto",
+        fusion: str | type[nn.Module] = "concat",
+        fusion_kwargs: Mapping[str, Any] | None = None,
         value_estimation: str = "have",
         refusion: str = "convex",
         attention_dim: int = 32,
@@ -93,6 +98,8 @@ class MultiModalPolicy(SACPolicy):
             "encoder_kwargs": encoder_kwargs,
             "signed_keys": signed_keys,
             "precision": precision,
+            "fusion": fusion,
+            "fusion_kwargs": fusion_kwargs,
         }
         self.value_kwargs: dict[str, Any] = {
             "value_estimation": value_estimation,
