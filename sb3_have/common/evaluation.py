@@ -239,11 +239,14 @@ def stratified_bootstrap(
     n_resamples: int = 2000,
     confidence: float = 0.95,
     seed: int = 0,
+    whole_runs: bool = False,
 ) -> Interval:
     """Percentile bootstrap that draws runs anew within each task, for each task and each table on its own.
 
     ``stratified_bootstrap(iqm, scores)`` and ``stratified_bootstrap(probability_of_improvement, x, y)`` are its uses.
     The interval covers too seldom when runs are few: with three, nothing lies beyond the best and the worst of them.
+    It also takes the scores of different tasks for independent, as they are when every task has agents of its own. One
+    agent's scores in several weathers rise and fall together; with ``whole_runs`` they stay together.
 
     :param statistic: of tables, reduces their last two axes: one of this module's, or e.g.
         ``partial(optimality_gap, target=500.0)``
@@ -251,24 +254,35 @@ def stratified_bootstrap(
     :param n_resamples: of the bootstrap
     :param confidence: between 0 and 1
     :param seed: of the resampling
+    :param whole_runs: whether rows are drawn rather than single scores: the same runs for every task
     :raises ValueError: if a table has one run only (nothing would vary), or is no finite table, or
         ``n_resamples`` or ``confidence`` are out of range
     """
-    estimate, lower, upper = _bootstrap(statistic, scores, n_resamples, confidence, seed)
+    estimate, lower, upper = _bootstrap(statistic, scores, n_resamples, confidence, seed, whole_runs)
     return Interval(float(estimate), float(lower), float(upper))
 
 
 def performance_profile_band(
-    scores: ArrayLike, thresholds: ArrayLike, n_resamples: int = 2000, confidence: float = 0.95, seed: int = 0
+    scores: ArrayLike,
+    thresholds: ArrayLike,
+    n_resamples: int = 2000,
+    confidence: float = 0.95,
+    seed: int = 0,
+    whole_runs: bool = False,
 ) -> Band:
     """:func:`performance_profile` with its pointwise confidence interval; parameters as there and as for
     :func:`stratified_bootstrap`."""
     profile = partial(performance_profile, thresholds=thresholds)
-    return Band(*_bootstrap(profile, (scores,), n_resamples, confidence, seed))
+    return Band(*_bootstrap(profile, (scores,), n_resamples, confidence, seed, whole_runs))
 
 
 def _bootstrap(
-    statistic: Callable[..., Any], scores: Sequence[ArrayLike], n_resamples: int, confidence: float, seed: int
+    statistic: Callable[..., Any],
+    scores: Sequence[ArrayLike],
+    n_resamples: int,
+    confidence: float,
+    seed: int,
+    whole_runs: bool = False,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Estimate, lower and upper bound, each of the statistic's shape."""
     if n_resamples < 1 or not 0 < confidence < 1:
@@ -285,8 +299,9 @@ def _bootstrap(
     rng = np.random.default_rng(seed)
     resampled = []
     for table in tables:
-        runs = rng.integers(len(table), size=(n_resamples, *table.shape))
-        resampled.append(table[runs, np.arange(table.shape[1])])
+        n_runs, n_tasks = table.shape
+        runs = rng.integers(n_runs, size=(n_resamples, n_runs, 1 if whole_runs else n_tasks))
+        resampled.append(table[runs, np.arange(n_tasks)])
     estimate, values = np.asarray(statistic(*tables)), np.asarray(statistic(*resampled))
     if values.shape != (n_resamples, *estimate.shape):
         raise ValueError(f"the statistic must reduce the last two axes, (..., n_runs, n_tasks); got {statistic}")
