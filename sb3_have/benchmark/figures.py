@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 from numpy.typing import ArrayLike
 
 from sb3_have.benchmark.reading import DISTANCE, Measure, Results, ordered
@@ -85,13 +86,17 @@ def plot_learning_curves(results: Results, reference: str = "have") -> Figure:
         for axis, measure in zip(row, measures, strict=True):
             for method in shown:
                 _draw_curve(axis, method, curves[method], measure, method == reference)
-            _draw_drivers(axis, results["drivers"], measure)
             axis.set(xlabel="training steps", ylabel=f"{measure.label}, mean of weathers")
             axis.grid(alpha=0.3)
             axis.set_xlim(left=0)
+            axis.xaxis.set_major_formatter(EngFormatter(sep=""))
             if measure == DISTANCE:
                 axis.set_ylim(bottom=0)
-        handles, labels = row[0].get_legend_handles_labels()
+    for row in axes:
+        for axis, measure in zip(row, measures, strict=True):
+            _draw_drivers(axis, results["drivers"], measure)
+        # the panel that shows most: a driver may be in one measure's reach and not in the other's
+        handles, labels = max((axis.get_legend_handles_labels() for axis in row), key=lambda both: len(both[1]))
         row[-1].legend(handles, labels, fontsize=SMALL, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     return figure
 
@@ -133,10 +138,17 @@ def _draw_curve(axis: Axes, method: str, curves: pd.DataFrame, measure: Measure,
 
 
 def _draw_drivers(axis: Axes, drivers: pd.DataFrame, measure: Measure) -> None:
-    """Levels of the drivers that did not learn."""
+    """Levels of the drivers that did not learn; those far above the curves in words, as they would flatten them."""
     means = drivers.groupby("driver", sort=False)[f"{measure.name}_mean"].mean()
+    bottom, top = axis.get_ylim()
+    limit, above = bottom + 1.5 * (top - bottom), []
     for (driver, level), line in zip(means.items(), ("--", ":", "-.") * len(means), strict=False):
-        axis.axhline(float(level), color="0.35", linestyle=line, linewidth=1, label=str(driver), zorder=1)
+        if level > limit:
+            above.append(f"{driver} {level:.0f}")
+        else:
+            axis.axhline(float(level), color="0.35", linestyle=line, linewidth=1, label=str(driver), zorder=1)
+    if above:
+        axis.set_title(f"above: {', '.join(above)}", fontsize=SMALL, color="0.35")
 
 
 def plot_scores(results: Results, reference: str = "have", table: pd.DataFrame | None = None) -> Figure:
@@ -178,7 +190,9 @@ def _plot_intervals(results: Results, table: pd.DataFrame, name: str, methods: l
             value, lower, upper = (rows[method][f"{name}{end}"] for end in ("", "_lower", "_upper"))
             look, known = style(method), bool(np.isfinite(lower))
             if known:
-                axis.plot([lower, upper], [place, place], color=look.colour, linewidth=5, alpha=0.45)
+                axis.plot(
+                    [lower, upper], [place, place], color=look.colour, linewidth=5, alpha=0.45, solid_capstyle="butt"
+                )
             face = look.colour if known else "white"
             axis.plot(value, place, look.marker, color=look.colour, markerfacecolor=face, markersize=8)
         axis.set_xlabel(label.format(measure.label))
@@ -258,10 +272,12 @@ def plot_weather_weights(results: Results) -> Figure:
         seeds = sorted(set(results["weights"].loc[results["weights"]["method"] == method, "seed"]))
         axis.set_title(f"{method}, {_seeds(seeds)}", fontsize=MEDIUM)
         axis.axhline(1 / len(colours), color="0.35", linestyle=":", linewidth=1, label="equal weights")
-        axis.set(ylabel="weight", ylim=(0, 1))
+        axis.set(ylabel="weight", ylim=(0, 1), axisbelow=True)
         axis.grid(axis="y", alpha=0.3)
     axes[-1].set_xticks(range(len(weathers)), [_broken(weather) for weather in weathers], fontsize=SMALL)
-    figure.legend(*axes[0].get_legend_handles_labels(), fontsize=SMALL, loc="outside upper center", ncols=6)
+    handles, labels = axes[0].get_legend_handles_labels()
+    handles, labels = [*handles[1:], handles[0]], [*labels[1:], labels[0]]  # the line of equal weights last
+    _legend_above(figure, handles, labels)
     return figure
 
 
@@ -301,7 +317,7 @@ def plot_episode_weights(results: Results, method: str, seed: int) -> Figure:
         axis.set_visible(False)
     figure.supxlabel("step of the episode", fontsize=MEDIUM)
     figure.supylabel("weight", fontsize=MEDIUM)
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), fontsize=SMALL, loc="outside upper center", ncols=6)
+    _legend_above(figure, *axes[0, 0].get_legend_handles_labels())
     return figure
 
 
@@ -338,10 +354,10 @@ def plot_kept(table: pd.DataFrame, measure: Measure) -> Figure:
         axis.set_xticks(range(len(cases)), labels)
         axis.set_title(f"{modality} fails", fontsize=MEDIUM)
         axis.axhline(1.0, color="0.35", linestyle="--", linewidth=1)
-        axis.set_ylabel(f"{measure.name} kept")
+        axis.set(ylabel=f"{measure.name} kept", axisbelow=True)
         axis.grid(axis="y", alpha=0.3)
-    shown = {method: handles[method] for method in methods if method in handles}
-    figure.legend(shown.values(), shown.keys(), fontsize=SMALL, loc="outside upper center", ncols=6)
+    shown = [method for method in methods if method in handles]
+    _legend_above(figure, [handles[method] for method in shown], shown)
     return figure
 
 
@@ -351,6 +367,10 @@ def _shares(rows: pd.DataFrame, measure: Measure) -> Mapping[tuple[str, int], di
         (row["kind"], row["severity"]): {name: row[f"{measure.name}_{name}"] for name in names}
         for row in rows.to_dict("records")
     }
+
+
+def _legend_above(figure: Figure, handles: Sequence[Any], labels: Sequence[str]) -> None:
+    figure.legend(handles, labels, fontsize=SMALL, loc="outside upper center", ncols=8, frameon=False)
 
 
 def _draw_whiskers(axis: Axes, places: Sequence[float], lowest: ArrayLike, highest: ArrayLike) -> None:

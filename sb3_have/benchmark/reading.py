@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+import yaml
 from numpy.typing import NDArray
 
 METHODS = (
@@ -85,23 +86,32 @@ class Results:
 
     :param folders: it was read from
     :param frames: by the names of :data:`FILES`; empty ones for files that are not there
+    :param planned: method and seed of the runs that the grids ask for, empty if the grids are not known
     """
 
     folders: tuple[Path, ...]
     frames: dict[str, pd.DataFrame]
+    planned: frozenset[tuple[str, int]] = frozenset()
 
     def __getitem__(self, name: str) -> pd.DataFrame:
         return self.frames[name]
 
     @property
     def methods(self) -> list[str]:
-        """Of all files, in the order of :data:`METHODS`."""
-        return ordered({name for frame in self._of_methods() for name in frame["method"]})
+        """Of all files and of the grids, in the order of :data:`METHODS`."""
+        planned = {method for method, _ in self.planned}
+        return ordered(planned.union(*(frame["method"] for frame in self._of_methods())))
 
     @property
     def seeds(self) -> list[int]:
-        """Of all files."""
-        return sorted({int(seed) for frame in self._of_methods() for seed in frame["seed"]})
+        """Of all files and of the grids."""
+        planned = {seed for _, seed in self.planned}
+        return sorted(planned.union(*(map(int, frame["seed"]) for frame in self._of_methods())))
+
+    def expected_seeds(self, method: str) -> list[int]:
+        """What the grids ask for; of a method in none of them, every seed that there is."""
+        planned = sorted(seed for name, seed in self.planned if name == method)
+        return planned or self.seeds
 
     @property
     def weathers(self) -> list[str]:
@@ -150,10 +160,12 @@ def ordered(methods: Iterable[str]) -> list[str]:
     return sorted(methods, key=lambda method: (place.get(method, len(place)), method))
 
 
-def read_results(folders: Sequence[Path]) -> Results:
+def read_results(folders: Sequence[Path], grids: Sequence[Path] | None = None) -> Results:
     """Read and join results folders.
 
     :param folders: of grids with the same settings; no run may be in two of them
+    :param grids: YAML files that say which runs there are to be; default: ``../../grids/<folder>.yml`` of each folder
+        where it exists, as for ``benchmarks/results/core`` and ``benchmarks/grids/core.yml``
     :raises ResultsError: if a folder has no results, or a file is broken: see :func:`read_csv`
     """
     parts: dict[str, list[pd.DataFrame]] = {name: [] for name in FILES}
@@ -172,7 +184,24 @@ def read_results(folders: Sequence[Path]) -> Results:
         if name == "runs":
             _check_settings(frame)
         frames[name] = frame.reset_index(drop=True)
-    return Results(tuple(folders), frames)
+    files = [path for path in map(grid_of, folders) if path.exists()] if grids is None else grids
+    return Results(tuple(folders), frames, frozenset(run for path in files for run in _planned(path)))
+
+
+def grid_of(folder: Path) -> Path:
+    """Where the grid of a results folder is looked for."""
+    return folder.resolve().parent.parent / "grids" / f"{folder.resolve().name}.yml"
+
+
+def _planned(path: Path) -> list[tuple[str, int]]:
+    """Method and seed of each run of a grid."""
+    try:
+        grid = yaml.safe_load(path.read_text(encoding="utf-8"))
+        names = [str(name) for name in grid["methods"]]
+        names = [Path(name).stem if name.endswith((".yml", ".yaml")) else name for name in names]
+        return [(name, int(seed)) for name in names for seed in grid["seeds"]]
+    except (OSError, yaml.YAMLError, KeyError, TypeError, ValueError) as error:
+        raise ResultsError(f"{path} is no grid with methods and seeds: {error!r}") from None
 
 
 def read_csv(path: Path) -> pd.DataFrame:

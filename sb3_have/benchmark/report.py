@@ -1,6 +1,6 @@
 """The report of a benchmark: ``report.md``, its figures, and its tables as CSV files, from the results of the runs.
 
-    python -m sb3_have.benchmark report benchmarks/results/core --out benchmarks/results/core/report
+    python -m sb3_have.benchmark report benchmarks/results/core benchmarks/results/extended --out report
 
 Several folders are joined, such as those of a grid and of its extension. A benchmark that is half done gives a report
 of what there is, and says what is missing.
@@ -19,7 +19,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from sb3_have.benchmark import figures, tables
-from sb3_have.benchmark.reading import RETURN, Measure, Results, ResultsError, ordered, read_results
+from sb3_have.benchmark.reading import RETURN, Measure, Results, ResultsError, grid_of, ordered, read_results
 
 DPI = 110
 INTERVALS = (
@@ -29,17 +29,23 @@ INTERVALS = (
 )
 
 
-def write_report(results: Path | Sequence[Path], out: Path, reference: str = "have") -> Path:
+def write_report(
+    results: Path | Sequence[Path],
+    out: Path | None = None,
+    reference: str = "have",
+    grids: Sequence[Path] | None = None,
+) -> Path:
     """Read results and write the report.
 
     :param results: folder or folders
-    :param out: folder of the report; made if need be
+    :param out: folder of the report, made if need be; default: ``report`` in the first folder
     :param reference: method that is compared with each of the others
+    :param grids: which runs there are to be, see :func:`~sb3_have.benchmark.reading.read_results`
     :return: path of ``report.md``
     :raises ResultsError: if results are missing or broken
     """
     folders = [results] if isinstance(results, Path) else list(results)
-    return Report(read_results(folders), out, reference).write()
+    return Report(read_results(folders, grids), out or folders[0] / "report", reference).write()
 
 
 class Report:
@@ -157,7 +163,8 @@ class Report:
         caption = (
             "Mean over weathers of the evaluations while training. Line: mean over seeds; band: from the lowest to the "
             "highest seed (no band for a single one). Number of seeds in brackets: of a method, only the seeds that "
-            "have come as far as its furthest count."
+            "have come as far as its furthest count. "
+            f"Episodes in each weather: {_episodes_by_step(self.results['evaluations'])}."
         )
         return ["## Learning curves", self._figure("learning_curves", figure, "Learning curves"), caption]
 
@@ -226,6 +233,16 @@ class Report:
         return f"![{text}]({name}.png)"
 
 
+def _episodes_by_step(evaluations: pd.DataFrame) -> str:
+    """How many episodes the points of the learning curves stand for."""
+    steps = {
+        int(count): sorted(set(evaluations.loc[evaluations["episodes"] == count, "step"]))
+        for count in sorted(set(evaluations["episodes"]))
+    }
+    told = [f"{n} at step {s[0]:,}" if len(s) == 1 else f"{n} at steps {s[0]:,} to {s[-1]:,}" for n, s in steps.items()]
+    return _listed(told)
+
+
 def missing(results: Results, table: pd.DataFrame) -> list[str]:
     """What a report has to say about runs that are not there.
 
@@ -237,9 +254,10 @@ def missing(results: Results, table: pd.DataFrame) -> list[str]:
         lines += [f"`{row['method']}`: seed " + "; seed ".join(absent)] if absent else []
     parts = []
     if lines:
-        parts.append("Missing, if every method is to have every seed:\n\n" + "\n".join(f"- {line}" for line in lines))
+        of_what = "of the grid" if results.planned else "if every method is to have every seed"
+        parts.append(f"Missing, {of_what}:\n\n" + "\n".join(f"- {line}" for line in lines))
     elif len(table):
-        parts.append("Every method has every seed.")
+        parts.append("The grid is finished." if results.planned else "Every method has every seed.")
     lengths = sorted(set(results.finished["step"]))
     if len(lengths) > 1:
         parts.append(
@@ -301,7 +319,9 @@ def provenance(results: Results, out: Path) -> list[str]:
             counts = runs[name].value_counts()
             parts.append(f"{title}:\n\n" + "\n".join(f"- {text} ({n} runs)" for text, n in counts.items()))
         parts += _settings(runs)
-    commands = [f"python -m sb3_have.benchmark run {folder.resolve().name}.yml" for folder in results.folders]
+    grids = [grid_of(folder) for folder in results.folders]
+    shown = [shlex.quote(_shown(grid) if grid.exists() else grid.name) for grid in grids]
+    commands = [f"python -m sb3_have.benchmark run {grid}" for grid in shown]
     folders = [shlex.quote(_shown(folder)) for folder in results.folders]
     commands.append(f"python -m sb3_have.benchmark report {' '.join(folders)} --out {shlex.quote(_shown(out))}")
     return [*parts, "Commands:", "```\n" + "\n".join(commands) + "\n```"]
@@ -355,10 +375,11 @@ def main(arguments: list[str] | None = None) -> None:
         prog="python -m sb3_have.benchmark report", description=(__doc__ or "").splitlines()[0]
     )
     parser.add_argument("results", nargs="+", type=Path, help="folders with the CSV files of a benchmark; joined")
-    parser.add_argument("--out", type=Path, required=True, help="folder of the report")
+    parser.add_argument("--out", type=Path, help="folder of the report; default: report in the first of them")
+    parser.add_argument("--grids", nargs="+", type=Path, help="which runs there are to be; default: found by name")
     parser.add_argument("--reference", default="have", help="method to compare with each of the others")
     args = parser.parse_args(arguments)
     try:
-        print(write_report(args.results, args.out, args.reference))
+        print(write_report(args.results, args.out, args.reference, args.grids))
     except ResultsError as error:
         raise SystemExit(str(error)) from None

@@ -233,7 +233,7 @@ def kept_markdown(table: pd.DataFrame, measure: Measure) -> str:
 def run_table(results: Results) -> pd.DataFrame:
     """How far every method is: which seeds are finished, under way, or not begun.
 
-    A seed of one method is expected of all. :func:`~sb3_have.benchmark.report.missing` says it in words.
+    Expected are the runs of the grids; if those are not known, every seed of every method.
 
     :return: a row for each method: ``method``, ``parameters``, ``steps`` (of the finished runs), ``finished``,
         ``under_way`` (seeds and the step of their newest evaluation), ``not_begun``, ``minutes`` (mean of a run)
@@ -244,7 +244,7 @@ def run_table(results: Results) -> pd.DataFrame:
         done = results.finished_seeds(method)
         own = every[(every["method"] == method) & ~every["seed"].isin(done)]
         under_way = {seed: own.loc[own["seed"] == seed, "step"].max() for seed in set(own["seed"])}
-        of_runs = runs[runs["method"] == method]
+        of_runs, expected = runs[runs["method"] == method], results.expected_seeds(method)
         rows.append(
             {
                 "method": method,
@@ -252,7 +252,7 @@ def run_table(results: Results) -> pd.DataFrame:
                 "steps": " / ".join(map(str, sorted(set(finished.loc[finished["method"] == method, "step"])))),
                 "finished": ", ".join(map(str, done)),
                 "under_way": ", ".join(f"{seed} (at {step})" for seed, step in sorted(under_way.items())),
-                "not_begun": ", ".join(str(s) for s in results.seeds if s not in done and s not in under_way),
+                "not_begun": ", ".join(str(s) for s in expected if s not in done and s not in under_way),
                 "minutes": round(of_runs["minutes"].mean(), 1) if len(of_runs) else np.nan,
             }
         )
