@@ -8,7 +8,7 @@ Features z are (B, d, F); the global features z_g are their concatenation (B, d*
 
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch as th
 import torch.nn.functional as F
@@ -119,9 +119,17 @@ class AssignmentNetwork(nn.Module):
         self.key = nn.Linear(features_dim, attention_dim, bias=False)
 
     def forward(self, features: th.Tensor) -> th.Tensor:
+        return F.softmax(self.scores(features), dim=1)
+
+    def scores(self, features: th.Tensor) -> th.Tensor:
+        """(W_q z_g) . (W_k z_i) / sqrt(p): features (B, d, F) to (B, d)."""
         query = self.query(features.flatten(start_dim=1)).unsqueeze(2)  # (B, p, 1)
-        scores = (self.key(features) @ query).squeeze(2)
-        return F.softmax(scores / math.sqrt(query.shape[1]), dim=1)
+        scores: th.Tensor = (self.keys(features) @ query).squeeze(2)
+        return scores / math.sqrt(query.shape[1])
+
+    def keys(self, features: th.Tensor) -> th.Tensor:
+        """W_k z_i: features (B, d, F) to (B, d, p)."""
+        return self.key(features)  # type: ignore[no-any-return]
 
 
 class RefusionNetwork(nn.Module):
@@ -188,6 +196,8 @@ class MultiModalCritic(BaseModel):
     :param attention_dim: p of Eq. 9
     """
 
+    assignment_class: ClassVar[type[AssignmentNetwork]] = AssignmentNetwork
+
     def __init__(
         self,
         observation_space: spaces.Space[Any],
@@ -211,7 +221,7 @@ class MultiModalCritic(BaseModel):
         heads = (n_modalities, features_dim, get_action_dim(action_space), net_arch, activation_fn, n_critics)
         if value_estimation != "gve":
             self.local_critics = LocalCritics(*heads)
-            self.assignment = AssignmentNetwork(n_modalities, features_dim, attention_dim)
+            self.assignment = self.assignment_class(n_modalities, features_dim, attention_dim)
         if value_estimation != "lve":
             self.global_critic = GlobalCritic(*heads)
         if value_estimation == "have":
@@ -219,21 +229,39 @@ class MultiModalCritic(BaseModel):
 
     def values(self, features: th.Tensor, actions: th.Tensor) -> Values:
         """All values at features (B, d, F) and actions (B, A), weights computed once and shared by the twins."""
-        q_global = q_local = q_lve = weights = None
+        q_global = q_local = weights = None
         if self.value_estimation != "gve":
             q_local = self.local_critics(features, actions)
             weights = self.assignment(features)
-            q_lve = (q_local * weights.t()).sum(dim=1)  # Eq. 6
         if self.value_estimation != "lve":
             q_global = self.global_critic(features, actions)
-        if q_lve is None:
-            q = q_global
-        elif q_global is None:
-            q = q_lve
-        else:
-            q = self.refusion(q_global, q_lve, features)  # section 3.4
-        assert q is not None
+        return self.mix(q_global, q_local, weights, features)
+
+    def mix(
+        self,
+        q_global: th.Tensor | None,
+        q_local: th.Tensor | None,
+        weights: th.Tensor | None,
+        features: th.Tensor,
+    ) -> Values:
+        """
+        From the single critics' values to the one that acts, for any number K of them.
+
+        :param q_global: (K, B), None for "lve"
+        :param q_local: (K, d, B), None for "gve"
+        :param weights: (B, d), None for "gve"
+        :param features: (B, d, F)
+        """
+        if q_local is None or weights is None:
+            assert q_global is not None
+            return Values(q_global, q_global, None, None, None)
+        q_lve = (q_local * weights.t()).sum(dim=1)  # Eq. 6
+        q = q_lve if q_global is None else self.refusion(q_global, q_lve, features)  # section 3.4
         return Values(q, q_global, q_local, q_lve, weights)
+
+    def min_q(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """(B,): the value that actor and target use, the minimum over the twins after mixing."""
+        return self.values(features, actions).q.min(dim=0).values
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         return tuple(self.values(self.encoder(obs), actions).q.unsqueeze(2))

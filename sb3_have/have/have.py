@@ -1,33 +1,29 @@
 """HAVESAC: soft actor-critic with Hierarchical Adaptive Value Estimation."""
 
-import io
-import pathlib
 from collections.abc import Mapping
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import polyak_update
 
-from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
+from sb3_have.common.augmentation import check_random_shift, shifted_copies
 from sb3_have.have.auxiliary import AuxiliaryLoss, LatentTransitions, auxiliary_classes, auxiliary_losses
 from sb3_have.have.critic import MultiModalCritic, Values, drop_modalities
-from sb3_have.have.policies import MultiModalPolicy, check_observation, check_stored_observation
+from sb3_have.have.experience import SensorSAC, has_images
+from sb3_have.have.policies import MultiModalPolicy
 
 SelfHAVESAC = TypeVar("SelfHAVESAC", bound="HAVESAC")
 TARGETS = ("bellman", "paper")
 
 
-class HAVESAC(SAC):
+class HAVESAC(SensorSAC):
     """
     Soft actor-critic with Hierarchical Adaptive Value Estimation (HAVE, NeurIPS 2023) for agents with several sensors.
 
@@ -52,11 +48,17 @@ class HAVESAC(SAC):
     :param policy_kwargs: of :class:`MultiModalPolicy`; may give ``value_estimation`` and ``refusion`` in its place
     :param target: "bellman": y = r + gamma (1 - done) (min_k H'_k - alpha log pi). "paper": Eq. 10 as it is written,
         both sides of the Bellman equation mixed, y = min_k H'_k(y_g, y_l) with y_j = r + gamma (1 - done)
-        (q'_j - alpha log pi). With "convex" re-fusion the two are equal; with "free" the second one diverges.
+        (q'_j - alpha log pi). With "convex" re-fusion, and without any ("lve", "gve"), the two are equal; with "free"
+        the second one diverges. The paper's method is ``target="paper", refusion="free", local_coef=0``, and its LVE
+        ``value_estimation="lve", local_coef=0``.
     :param local_coef: weight of the loss that also regresses q_g, q_l and every local value on the target (0 is the
         paper)
     :param modality_dropout: probability with which a modality's features are blanked in a training sample, for critic
         and actor alike, never all of them
+    :param random_shift: pixels by which the images of a training sample are shifted at most, all sensors' alike, as in
+        DrQ (4 there), see :func:`~sb3_have.common.augmentation.random_shift`; 0 shifts nothing
+    :param n_augmentations: DrQ's K and M (2 there): differently shifted copies of a sample, over which target and
+        critic's loss are averaged; auxiliary losses and actor take the first
     :param auxiliary: "deepmdp", None, or ``{name: AuxiliaryLoss class}`` ("deepmdp" included where wanted): the
         auxiliary losses that are trained, with coefficient 1 (see :class:`~sb3_have.DeepMDPCallback`)
     :param compile: whether to compile encoders, critics and auxiliary heads by ``torch.nn.Module.compile``, which
@@ -101,6 +103,8 @@ class HAVESAC(SAC):
         target: str = "bellman",
         local_coef: float = 1.0,
         modality_dropout: float = 0.0,
+        random_shift: int = 0,
+        n_augmentations: int = 1,
         auxiliary: str | Mapping[str, type[AuxiliaryLoss]] | None = "deepmdp",
         compile: bool = False,
         stats_window_size: int = 100,
@@ -161,9 +165,10 @@ class HAVESAC(SAC):
         self.target = target
         self.local_coef = local_coef
         self.modality_dropout = modality_dropout
+        self.random_shift = random_shift
+        self.n_augmentations = n_augmentations
         self.auxiliary_coefs = {term: 1.0 for loss in losses.values() for term in loss.terms}
         self.compile = compile
-        self.n_stack = 1
         self._last_losses: dict[str, th.Tensor] = {}
         if _init_setup_model:
             self._setup_model()
@@ -179,25 +184,13 @@ class HAVESAC(SAC):
         for name in ("policy_delay", "target_update_interval"):
             if not (isinstance(interval := getattr(self, name), int) and interval >= 1):
                 raise ValueError(f"{name}={interval!r}: expected a whole number of updates, from 1 on.")
-        if self.env is not None:  # else the model is being loaded, and this with it
-            self.n_stack = stacked_frames(self.env)
-        if self.replay_buffer_class is None and (self.n_steps > 1 or _has_images(self.observation_space)):
-            self.replay_buffer_class = ModalityReplayBuffer
-        given = self.n_steps, self.replay_buffer_kwargs
-        if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, ModalityReplayBuffer):
-            self.replay_buffer_kwargs = self._replay_buffer_kwargs()
-            self.n_steps = 1  # SB3 would warn that it is ignored
+        check_random_shift(self.observation_space, self.random_shift, self.n_augmentations)
         super()._setup_model()
-        self.n_steps, self.replay_buffer_kwargs = given
         if self.compile:
             for module in (*self.critic.children(), *self.critic_target.children(), *self.policy.auxiliary.values()):
                 module.compile()
-        if self.verbose >= 1 and _has_images(self.observation_space):
+        if self.verbose >= 1 and has_images(self.observation_space):
             print(f"Image encoders compute in {self.critic.encoder.image_dtype(self.device)}")
-
-    def _replay_buffer_kwargs(self) -> dict[str, Any]:
-        """Of a ModalityReplayBuffer: what the user gave, and what follows from environment and algorithm."""
-        return {"n_stack": self.n_stack, "n_steps": self.n_steps, "gamma": self.gamma, **self.replay_buffer_kwargs}
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         self.policy.set_training_mode(True)
@@ -214,6 +207,9 @@ class HAVESAC(SAC):
         for _ in range(gradient_steps):
             self._n_updates += 1
             replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
+            first = slice(len(replay_data.rewards))
+            if self.random_shift > 0:  # DrQ: copies of the batch one behind the other, the first of them at ``first``
+                replay_data = shifted_copies(replay_data, self.random_shift, self.n_augmentations)
             discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
 
             # Each observation is encoded once; the target encoder's features also feed the next action and DeepMDP
@@ -232,12 +228,13 @@ class HAVESAC(SAC):
                 rewards, not_done = replay_data.rewards.squeeze(1), 1 - replay_data.dones.squeeze(1)
                 discounts = (discounts.squeeze(1) if isinstance(discounts, th.Tensor) else discounts) * not_done
                 target_q = self._target_values(next_features, next_actions, rewards, discounts, entropy_bonus)
+                # DrQ's K and M: all copies of a sample have the mean of their targets
+                target_q = target_q.view(self.n_augmentations, -1).mean(dim=0).repeat(self.n_augmentations)
             values = self.critic.values(inputs, replay_data.actions)
             critic_loss = self._critic_loss(values, target_q)
             logs.setdefault("critic_loss", []).append(critic_loss.detach())
-            batch = LatentTransitions(
-                features, replay_data.actions, replay_data.rewards, next_features, replay_data.dones
-            )
+            latent = (features, replay_data.actions, replay_data.rewards, next_features, replay_data.dones)
+            batch = LatentTransitions(*(tensor[first] for tensor in latent))
             loss = critic_loss
             for term, aux_loss in auxiliary_losses(self.policy.auxiliary, batch, self.auxiliary_coefs).items():
                 loss = loss + self.auxiliary_coefs[term] * aux_loss
@@ -249,7 +246,7 @@ class HAVESAC(SAC):
             # Entropy temperature (see SB3's SAC), and actor (Eq. 11): minimum over the twins after mixing, gradients
             # for the actor's parameters alone
             if self._n_updates % self.policy_delay == 0:
-                actor_inputs = inputs.detach()
+                actor_inputs = inputs[first].detach()
                 actions_pi, log_prob = self.actor.action_log_prob(actor_inputs.flatten(start_dim=1))
                 if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
                     ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
@@ -257,7 +254,7 @@ class HAVESAC(SAC):
                     ent_coef_loss.backward()  # type: ignore[no-untyped-call]
                     self.ent_coef_optimizer.step()
                     logs.setdefault("ent_coef_loss", []).append(ent_coef_loss.detach())
-                min_q_pi = self.critic.values(actor_inputs, actions_pi).q.min(dim=0).values
+                min_q_pi = self.critic.min_q(actor_inputs, actions_pi)
                 actor_loss = (ent_coef * log_prob - min_q_pi).mean()
                 gradients = th.autograd.grad(actor_loss, actor_parameters, allow_unused=True)
                 for parameter, gradient in zip(actor_parameters, gradients, strict=True):
@@ -307,13 +304,13 @@ class HAVESAC(SAC):
         :param discounts: (B,) gamma, 0 where the episode ended
         :param entropy_bonus: (B,) -alpha log pi(a'|z')
         """
-        values = self.critic_target.values(next_features, next_actions)
-        if self.target == "paper" and values.q_global is not None and values.q_lve is not None:
-            target_global = rewards + discounts * (values.q_global + entropy_bonus)
-            target_lve = rewards + discounts * (values.q_lve + entropy_bonus)
+        if self.target == "paper" and self.critic_target.value_estimation == "have":
+            values = self.critic_target.values(next_features, next_actions)
+            target_global = rewards + discounts * (values.q_global + entropy_bonus)  # type: ignore[operator]
+            target_lve = rewards + discounts * (values.q_lve + entropy_bonus)  # type: ignore[operator]
             mixed: th.Tensor = self.critic_target.refusion(target_global, target_lve, next_features)
             return mixed.min(dim=0).values  # Eq. 10
-        return rewards + discounts * (values.q.min(dim=0).values + entropy_bonus)
+        return rewards + discounts * (self.critic_target.min_q(next_features, next_actions) + entropy_bonus)
 
     def _critic_loss(self, values: Values, target_q: th.Tensor) -> th.Tensor:
         """
@@ -335,19 +332,6 @@ class HAVESAC(SAC):
             loss = loss + self.local_coef * sum(squared_error(part) for part in parts if part is not None)
         return loss
 
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        """
-        :param path: of the pickled replay buffer
-        :param truncate_last_traj: whether the last trajectory ends where the buffer was saved; False if the environment
-            goes on from there
-        """
-        super().load_replay_buffer(path, truncate_last_traj)
-        if isinstance(self.replay_buffer, ModalityReplayBuffer):
-            kwargs = self._replay_buffer_kwargs()
-            self.replay_buffer.n_steps, self.replay_buffer.gamma = kwargs["n_steps"], kwargs["gamma"]
-            if truncate_last_traj:
-                self.replay_buffer.truncate_last_trajectory()
-
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_last_losses"]
 
@@ -364,42 +348,6 @@ class HAVESAC(SAC):
         with th.no_grad():
             weights = self.critic.weights(self.policy.encode(obs)).cpu().numpy()
         return dict(zip(self.critic.encoder.modalities, weights.T, strict=True))
-
-    def _setup_learn(
-        self,
-        total_timesteps: int,
-        callback: MaybeCallback = None,
-        reset_num_timesteps: bool = True,
-        tb_log_name: str = "run",
-        progress_bar: bool = False,
-    ) -> tuple[int, BaseCallback]:
-        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
-        assert self._last_obs is not None
-        check_observation(self._last_obs, self.observation_space)
-        if self._vec_normalize_env is not None:
-            assert self._last_original_obs is not None
-            check_stored_observation(self._last_original_obs, self.observation_space)
-        return result
-
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        """Refuses NaN before it reaches the replay buffer, where it would spoil the networks unseen."""
-        last_observations = [info.get("terminal_observation") for info in infos]  # new_obs has the next episode's first
-        for observation in [new_obs, *(last for last in last_observations if last is not None)]:
-            check_observation(observation, self.observation_space)
-        if not np.isfinite(reward).all():
-            raise ValueError(
-                f"reward: got {reward} at step {self.num_timesteps}, expected finite numbers; mend the environment's "
-                "reward function (SB3's VecCheckNan shows where it comes from)."
-            )
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def learn(
         self: SelfHAVESAC,
@@ -418,7 +366,3 @@ class HAVESAC(SAC):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
-
-
-def _has_images(space: spaces.Space[Any]) -> bool:
-    return any(map(is_image_space, space.spaces.values() if isinstance(space, spaces.Dict) else [space]))
