@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import platform
 import time
 from collections.abc import Callable, Mapping, Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -14,8 +12,9 @@ import pandas as pd
 import torch as th
 from numpy.typing import NDArray
 
+from sb3_have.common.machine import machine as machine
+
 RESULTS = Path(__file__).parent / "results"
-PACKAGES = ("torch", "stable-baselines3", "numpy")
 Name = TypeVar("Name")
 Row = dict[str, Any]
 Floats = NDArray[np.float64]
@@ -72,24 +71,6 @@ def quartiles(times: Floats, prefix: str = "", digits: int = 3) -> Row:
 def median_ratio(numerator: Floats, denominator: Floats) -> float:
     """Median over the rounds of the ratio of two contenders in the same round."""
     return float(np.median(numerator / denominator))
-
-
-def machine(device: str = "cpu") -> Row:
-    """The machine and the versions, as columns of a row."""
-    hardware = f"{cpu_model()}, {'with' if th.cpu._is_amx_tile_supported() else 'no'} AMX"
-    if device != "cpu":
-        hardware += f", {th.cuda.get_device_name(device)}"
-    packages = [f"Python {platform.python_version()}", *(f"{name} {version(name)}" for name in PACKAGES)]
-    return {"machine": hardware, "versions": ", ".join(packages)}
-
-
-def cpu_model() -> str:
-    info = Path("/proc/cpuinfo")
-    if info.exists():
-        for line in info.read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()
 
 
 def save(rows: Sequence[Row], path: Path, group: Sequence[str]) -> None:

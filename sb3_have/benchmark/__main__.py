@@ -1,0 +1,21 @@
+"""``python -m sb3_have.benchmark run GRID.yml`` and ``... report FOLDER``; each knows ``--help``."""
+
+from __future__ import annotations
+
+import sys
+from importlib import import_module
+
+COMMANDS = {"run": "sb3_have.benchmark.runner", "report": "sb3_have.benchmark.report"}
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Hand over to a command; it alone is imported, so that a report needs nothing that only runs need."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments or arguments[0] not in COMMANDS:
+        print(f"usage: python -m sb3_have.benchmark {{{','.join(COMMANDS)}}} ...\n{__doc__}", file=sys.stderr)
+        return 0 if arguments in (["-h"], ["--help"]) else 2
+    return import_module(COMMANDS[arguments[0]]).main(arguments[1:]) or 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

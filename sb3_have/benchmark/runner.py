@@ -1,0 +1,242 @@
+"""Run a grid: methods x seeds side by side, to be stopped and started again at any moment.
+
+    python -m sb3_have.benchmark run benchmarks/grids/core.yml
+
+Ctrl-C, SIGTERM and ``--time-limit`` let every run save a checkpoint; the same command goes on, also after a crash of
+the machine. Finished runs are not repeated. Runs are in RUNS/<method>-<seed>/, results in RESULTS/*.csv, which grow by
+a run at a time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from types import FrameType
+from typing import Any, Protocol
+
+from tqdm import tqdm
+
+from sb3_have.benchmark.grid import Grid, GridError, Job, read_grid
+from sb3_have.benchmark.pool import RayPool
+from sb3_have.benchmark.results import is_finished, merge
+from sb3_have.benchmark.stages import collect, locked, steps_done
+
+RETRIES = 2
+REFRESH_SECONDS = 2.0
+GRACE_SECONDS = 300.0
+"""For all runs to save their checkpoints, replay buffers and all, when they are asked to stop."""
+
+FINISHED, FAILED, STOPPED = 0, 1, 3
+
+
+class Pool(Protocol):
+    """What :class:`~sb3_have.benchmark.pool.RayPool` does."""
+
+    workers: int
+
+    @property
+    def running(self) -> list[Job]: ...
+    def start(self, job: Job) -> None: ...
+    def wait(self, seconds: float) -> list[tuple[Job, bool | Exception]]: ...
+    def stop(self) -> None: ...
+
+
+class Runner:
+    """The runs of a grid, their results and how far they are.
+
+    :param jobs: to run, in order
+    :param runs: folder of the runs' folders
+    :param results: folder of the results
+    :param retries: how often a run that dies is started again
+    :param time_limit: of this call [s]; None for none
+    :raises GridError: if the results hold one of the runs with other settings
+    """
+
+    def __init__(
+        self, jobs: Sequence[Job], runs: Path, results: Path, retries: int = RETRIES, time_limit: float | None = None
+    ) -> None:
+        self.jobs, self.runs, self.results, self.retries = jobs, runs, results, retries
+        self.finished = {job.name for job in jobs if is_finished(results, job)}
+        self.failed: list[str] = []
+        self.stopping = False
+        self._todo = deque(job for job in jobs if job.name not in self.finished)
+        self._attempts = dict.fromkeys((job.name for job in jobs), 0)
+        self._deadline = None if time_limit is None else time.monotonic() + time_limit
+
+    @property
+    def is_done(self) -> bool:
+        """Whether nothing is left to do."""
+        return not self._todo
+
+    def run(self, pool: Pool) -> int:
+        """Work until all is done or a stop is asked for.
+
+        :return: exit code, 0 if every run is finished, 1 if one failed for good, 3 if stopped before the end
+        """
+        total = sum(job.grid.steps for job in self.jobs)
+        # a log file gets a line now and then, a terminal a bar that moves
+        interval = 0.1 if sys.stderr.isatty() else 60.0
+        with tqdm(total=total, initial=self._steps(), unit="step", smoothing=0, mininterval=interval) as bar:
+            with self._signals():
+                self._work(pool, bar)
+            bar.n = self._steps()
+        return self._conclude()
+
+    def _work(self, pool: Pool, bar: tqdm[Any]) -> None:
+        stopped_at = None
+        while pool.running or (self._todo and not self.stopping):
+            if self._deadline is not None and time.monotonic() > self._deadline:
+                self.stopping = True
+            if self.stopping and stopped_at is None:
+                stopped_at = time.monotonic()
+                bar.write(f"stopping: {len(pool.running)} runs save what they have")
+                pool.stop()
+            elif stopped_at is not None and time.monotonic() - stopped_at > GRACE_SECONDS:
+                bar.write(f"gave up waiting for {', '.join(job.name for job in pool.running)}")
+                return
+            while self._todo and len(pool.running) < pool.workers and not self.stopping:
+                pool.start(self._todo.popleft())
+            for job, outcome in pool.wait(REFRESH_SECONDS):
+                bar.write(self._settle(job, outcome))
+            bar.set_postfix_str(", ".join(job.name for job in pool.running), refresh=False)
+            bar.n = self._steps()
+            bar.update(0)
+
+    def _settle(self, job: Job, outcome: bool | Exception) -> str:
+        """Take in how a run ended; a line about it."""
+        if outcome is True:
+            tables = collect(job, self.runs / job.name)
+            merge(self.results, job, tables)
+            self.finished.add(job.name)
+            (self.runs / job.name / "traceback.txt").unlink(missing_ok=True)
+            last, minutes = tables["final"], float(tables["runs"]["minutes"].iloc[0])
+            return (
+                f"{job.name}: return {last['return_mean'].mean():.1f}, distance {last['distance_mean'].mean():.0f} m "
+                f"over {len(last)} weathers, {minutes:.1f} min; {len(self.finished)} of {len(self.jobs)} runs finished"
+            )
+        if outcome is False:
+            if not self.stopping:  # it was stopped by somebody else
+                return self._again(job, "it was stopped from outside")
+            return f"{job.name}: stopped at step {steps_done(self.runs / job.name)}"
+        path = self.runs / job.name / "traceback.txt"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"{outcome}\n")
+        lines = str(outcome).strip().splitlines()
+        return self._again(job, lines[-1] if lines else type(outcome).__name__)
+
+    def _again(self, job: Job, reason: str) -> str:
+        self._attempts[job.name] += 1
+        attempt, attempts = self._attempts[job.name], self.retries + 1
+        told = f"{job.name} died ({reason})"
+        if attempt == attempts:
+            self.failed.append(job.name)
+            return f"{told} for the {attempt}. time, and is left; see {self.runs / job.name / 'traceback.txt'}"
+        self._todo.appendleft(job)
+        return f"{told} and goes on from its checkpoint, attempt {attempt + 1} of {attempts}"
+
+    def _steps(self) -> int:
+        """Done by all runs; after the last one a run still evaluates."""
+        done = 0
+        for job in self.jobs:
+            whole = job.grid.steps
+            done += whole if job.name in self.finished else min(steps_done(self.runs / job.name), whole)
+        return done
+
+    def _conclude(self) -> int:
+        print(f"{len(self.finished)} of {len(self.jobs)} runs finished, results in {self.results}")
+        for name in self.failed:
+            print(f"failed: {name}, {self.runs / name / 'traceback.txt'}")
+        if self.failed:
+            return FAILED
+        if len(self.finished) < len(self.jobs):
+            print("stopped; the same command goes on")
+            return STOPPED
+        return FINISHED
+
+    @contextmanager
+    def _signals(self) -> Iterator[None]:
+        """The first Ctrl-C or SIGTERM stops in good order, the second at once."""
+
+        def stop(number: int, frame: FrameType | None) -> None:
+            if self.stopping:
+                raise KeyboardInterrupt
+            self.stopping = True
+
+        before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for number, handler in before.items():
+                signal.signal(number, handler)
+
+
+def describe(grid: Grid, jobs: Sequence[Job], runner: Runner) -> str:
+    """What is about to happen."""
+    lines = [f"{grid.name}: {len(jobs)} runs of {grid.steps} steps, {len(runner.finished)} of them finished before"]
+    return "\n".join(lines + grid.overruled())
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Command line of ``python -m sb3_have.benchmark run``."""
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_have.benchmark run",
+        description=(__doc__ or "").splitlines()[0],
+        epilog="Exit code: 0 if all runs are finished, 1 if some failed for good, 3 if stopped before the end.",
+    )
+    parser.add_argument("grid", type=Path, help="YAML file, see sb3_have.benchmark.grid")
+    parser.add_argument(
+        "--address",
+        help="of a Ray cluster (auto, host:6379); RUNS must then be on a file system that all its machines share under "
+        "the same path",
+    )
+    parser.add_argument("--runs", type=Path, help="folder of the runs; default: runs/<name of the grid>")
+    parser.add_argument("--results", type=Path, help="default: benchmarks/results/<name of the grid>")
+    parser.add_argument("--workers", type=int, help="runs at a time; default: one for each CPU")
+    parser.add_argument(
+        "--gpus", type=float, default=0.0, help="share of a GPU for each run, e.g. 0.125; default: none"
+    )
+    parser.add_argument("--only", nargs="+", default=[], metavar="METHOD", help="leave the other methods out")
+    parser.add_argument("--time-limit", type=float, metavar="SECONDS", help="stop after that, as on Ctrl-C")
+    parser.add_argument("--retries", type=int, default=RETRIES, help="of a run that dies")
+    parser.add_argument(
+        "--keep-checkpoints", action="store_true", help="of finished runs, so that a grid of more steps can go on"
+    )
+    args = parser.parse_args(arguments)
+    if args.workers is not None and args.workers < 1:
+        parser.error(f"--workers must be >= 1, got {args.workers}")
+
+    try:
+        grid = read_grid(args.grid)
+        jobs = grid.jobs(args.only)
+        # Ray's workers need not have this directory
+        runs = (args.runs or Path("runs") / grid.name).resolve()
+        results = (args.results or Path("benchmarks") / "results" / grid.name).resolve()
+        results.mkdir(parents=True, exist_ok=True)
+        with locked(results, patience=5.0):
+            runner = Runner(jobs, runs, results, args.retries, args.time_limit)
+            print(describe(grid, jobs, runner), flush=True)
+            if runner.is_done:
+                return runner._conclude()
+            if args.address is not None:
+                print(f"the machines of {args.address} must share {runs}")
+            pool = RayPool(runs, args.address, args.workers, args.gpus, args.keep_checkpoints)
+            try:
+                return runner.run(pool)
+            finally:
+                pool.close()
+    except (GridError, OSError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return FAILED
+    except KeyboardInterrupt:
+        print("stopped at once; the same command goes on from the last checkpoints", file=sys.stderr)
+        return STOPPED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,342 @@
+"""What is done with one run: trained, driven in every weather, asked for its weights, and with sensors that fail.
+
+All of it goes into the run's folder, step by step and each step whole, so that a run which dies goes on where it was:
+
+    monitor.csv, evaluation.csv, checkpoint-<step>/, model.zip    of :class:`sb3_have.train.Run`
+    final-<steps>/training.json                                   the training is over; what it took
+    final-<steps>/episodes.csv, weights.csv, failures.csv         a weather at a time
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import os
+import shutil
+import time
+from collections.abc import Iterator, Sequence
+from functools import partial
+from itertools import count
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_have import HAVESAC
+from sb3_have.benchmark.grid import Failures, Job
+from sb3_have.benchmark.reading import FILES
+from sb3_have.benchmark.results import difference, read_text_table, settings_column, write_atomically
+from sb3_have.common.episodes import EpisodeQueue, Task, match_observations
+from sb3_have.common.evaluation import evaluate_episodes, summarize
+from sb3_have.common.machine import machine
+from sb3_have.configuration import Env, env_wrapper, evaluation_env_kwargs
+from sb3_have.sensors import SENSORS, SensorFailure, failures_for
+from sb3_have.train import Run, algorithms, checkpoint_step, newest_checkpoint
+
+FINAL_SEED = 2_000_000
+"""Of the episodes after training: the same for all methods and seeds, and none that a run was trained or chosen by
+(:data:`sb3_have.train.EVALUATION_SEED`)."""
+
+DIGITS = 4
+LOCK_SECONDS = 60.0
+"""How long to wait for a process that is just dying."""
+
+KEY = ["method", "seed"]
+HEALTHY = {"modality": "none", "kind": "none", "severity": 0}
+
+
+def run_job(job: Job, runs: Path, device: str = "cpu", keep_checkpoint: bool = False) -> bool:
+    """Do what is still to be done of a run.
+
+    :param job: the run
+    :param runs: folder of the runs' folders
+    :param device: of the model
+    :param keep_checkpoint: whether the replay buffer stays, so that a grid of more steps can go on from here
+    :return: whether it is finished; False if it was asked to stop while it trained
+    """
+    folder = runs / job.name
+    folder.mkdir(parents=True, exist_ok=True)
+    with locked(folder):
+        model = trained(job, folder, device)
+        if model is None:
+            return False
+        if not keep_checkpoint:
+            _drop_checkpoints(folder)
+        drive_finally(job, model, folder)
+        if has_weights(model):
+            watch_weights(job, model, folder)
+        if job.grid.failures is not None:
+            break_sensors(job, model, folder, job.grid.failures)
+    return True
+
+
+@contextlib.contextmanager
+def locked(folder: Path, patience: float = LOCK_SECONDS) -> Iterator[None]:
+    """Have a folder for oneself; the lock goes with the process, however it ends.
+
+    :param folder: to lock
+    :param patience: seconds to wait for another process to end
+    :raises BlockingIOError: if it does not
+    """
+    handle, start = os.open(folder, os.O_RDONLY), time.monotonic()
+    try:
+        while True:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() - start > patience:
+                    raise BlockingIOError(f"another process works in {folder}; end it, or wait for it") from None
+                time.sleep(0.5)
+        yield
+    finally:
+        os.close(handle)
+
+
+def final_folder(job: Job, folder: Path) -> Path:
+    """Where a run keeps what it did after its training."""
+    return folder / f"final-{job.grid.steps}"
+
+
+def trained(job: Job, folder: Path, device: str) -> OffPolicyAlgorithm | None:
+    """The trained model, from where the training was; None if it was stopped."""
+    record = final_folder(job, folder) / "training.json"
+    if record.exists():
+        return _reload(job, folder, json.loads(record.read_text()), device)
+    if newest_checkpoint(folder) is None and (earlier := [*folder.glob("final-*/training.json")]):
+        raise ValueError(
+            f"{folder} is a finished run of other length ({earlier[0].parent.name}) without its checkpoint, so it "
+            "cannot go on; choose another --runs (and --keep-checkpoints, for runs that will be made longer)"
+        )
+    grid = job.grid
+    run = Run(
+        job.config,
+        grid.env,
+        folder,
+        seed=job.seed,
+        algo=job.algo,
+        eval_freq=grid.eval_freq,
+        eval_episodes=grid.eval_episodes,
+        weathers=grid.weathers,
+        save_freq=grid.save_freq,
+        device=device,
+    )
+    model = run.train(grid.steps)
+    if model.num_timesteps < grid.steps:
+        return None
+    record.parent.mkdir(exist_ok=True)
+    told = {"settings": job.settings, "steps": model.num_timesteps, "minutes": round(run.seconds / 60, 2)}
+    told |= {"parameters": n_parameters(model), **machine(device)}
+    write_atomically(record, partial(Path.write_text, data=json.dumps(told, indent=1)))
+    return model
+
+
+def _reload(job: Job, folder: Path, record: dict[str, Any], device: str) -> OffPolicyAlgorithm:
+    if told := difference(record["settings"], job.settings):
+        raise ValueError(f"{folder} is of a run with other settings ({told}); choose another --runs, or remove it")
+    model = algorithms()[job.algo].load(folder / "model.zip", device=device)
+    if model.num_timesteps != record["steps"]:
+        raise ValueError(
+            f"{folder / 'model.zip'} has gone on to step {model.num_timesteps} from step {record['steps']}, "
+            "at which it should be driven; choose another --runs"
+        )
+    return model
+
+
+def _drop_checkpoints(folder: Path) -> None:
+    for checkpoint in folder.glob("checkpoint-*"):
+        # renamed first: half a checkpoint must not look like a whole one
+        shutil.rmtree(checkpoint.rename(folder / "checkpoint.partial"))
+
+
+def n_parameters(model: OffPolicyAlgorithm) -> int:
+    """Numbers that the training changes by gradients, in actor, critic and all that belongs to them."""
+    return sum(
+        parameter.numel()
+        for name, parameter in model.policy.named_parameters()
+        if parameter.requires_grad and not name.startswith("critic_target.")
+    )
+
+
+def has_weights(model: OffPolicyAlgorithm) -> bool:
+    """Whether a model weighs its modalities."""
+    return isinstance(model, HAVESAC) and model.critic.value_estimation != "gve"
+
+
+def drive_finally(job: Job, model: OffPolicyAlgorithm, folder: Path) -> None:
+    """Deterministic episodes in each weather: ``episodes.csv``."""
+    grid, path = job.grid, final_folder(job, folder) / "episodes.csv"
+    for weather in grid.weathers:
+        if len(_rows_of(path, weather=weather)) == grid.final_episodes:
+            continue
+        episodes = _drive(job, model, weather, grid.final_episodes)
+        _replace(path, episodes, {"weather": weather})
+
+
+def _drive(
+    job: Job, model: OffPolicyAlgorithm, weather: str, n_episodes: int, failure: dict[str, Any] | None = None
+) -> pd.DataFrame:
+    """Episodes as rows of ``episodes.csv``, a sensor failing if asked for."""
+    wrapper = partial(_wrapped, config=job.config, failure=failure)
+    episodes = evaluate_episodes(
+        model, job.grid.env, [weather], n_episodes, FINAL_SEED, evaluation_env_kwargs(job.config), env_wrapper=wrapper
+    ).rename(columns={"seed": "episode_seed"})
+    for column in ("crashed", "offroad"):
+        episodes[column] = episodes[column].map({0.0: False, 1.0: True})  # NaN stays
+    return episodes.round({"return": DIGITS, "distance": DIGITS})
+
+
+def _wrapped(env: Env, config: dict[str, Any], failure: dict[str, Any] | None) -> Env:
+    """As in training, a failing sensor outermost."""
+    inner = env_wrapper(config)
+    env = env if inner is None else inner(env)
+    return env if failure is None else SensorFailure(env, **failure)
+
+
+def watch_weights(job: Job, model: OffPolicyAlgorithm, folder: Path) -> None:
+    """The modalities' weights at each step of the first final episode in each weather: ``weights.csv``."""
+    path = final_folder(job, folder) / "weights.csv"
+    for weather in job.grid.weathers:
+        if len(_rows_of(path, weather=weather)):
+            continue
+        seed = int(_rows_of(path.with_name("episodes.csv"), weather=weather)["episode_seed"].iloc[0])
+        _replace(path, weights_of_episode(job, model, Task(weather, seed)), {"weather": weather})
+
+
+def weights_of_episode(job: Job, model: Any, task: Task) -> pd.DataFrame:
+    """A row per step and modality: its weight before the action, and the return up to there."""
+    wrapper = partial(_wrapped, config=job.config, failure=None)
+    make = partial(EpisodeQueue, job.grid.env, [task], evaluation_env_kwargs(job.config), wrapper)
+    env = match_observations(DummyVecEnv([make]), model)
+    rows, so_far = [], 0.0
+    try:
+        observations = env.reset()
+        for t in count():
+            for modality, weight in model.modality_weights(observations).items():
+                told = {"weight": float(weight[0]), "return_so_far": so_far}
+                rows.append({"weather": task.weather, "episode_seed": task.seed, "t": t, "modality": modality, **told})
+            actions, _ = model.predict(observations, deterministic=True)
+            observations, rewards, dones, _ = env.step(actions)
+            so_far += float(rewards[0])
+            if dones[0]:
+                break
+    finally:
+        env.close()
+    return pd.DataFrame(rows).round(DIGITS)
+
+
+def break_sensors(job: Job, model: OffPolicyAlgorithm, folder: Path, failures: Failures) -> None:
+    """Each modality failing in each way for whole episodes, beside the healthy ones: ``failures.csv``."""
+    path = final_folder(job, folder) / "failures.csv"
+    for weather in job.grid.weathers:
+        for case in failure_cases(model, failures):
+            key = {"weather": weather, **case}
+            done = _rows_of(path, **key)
+            if len(done) and int(done["episodes"].iloc[0]) == failures.episodes:
+                continue
+            if case == HEALTHY:
+                episodes = _typed(_rows_of(path.with_name("episodes.csv"), weather=weather)).head(failures.episodes)
+            else:
+                episodes = _drive(job, model, weather, failures.episodes, case)
+            _replace(path, pd.DataFrame([{**case, **_summary(episodes).iloc[0]}]), key)
+
+
+def failure_cases(model: OffPolicyAlgorithm, failures: Failures) -> list[dict[str, Any]]:
+    """The healthy car, then every modality with every kind of failure it knows."""
+    modalities = [name for name in getattr(model.observation_space, "spaces", {}) if name in SENSORS]
+    return [HEALTHY] + [
+        {"modality": modality, "kind": kind, "severity": failures.severity}
+        for modality in modalities
+        for kind in failures.kinds
+        if kind in failures_for(modality)
+    ]
+
+
+def _summary(episodes: pd.DataFrame) -> pd.DataFrame:
+    columns = ["weather", "return_mean", "return_std", "distance_mean", "distance_std", "episodes"]
+    return summarize(episodes)[columns].round(DIGITS)
+
+
+def collect(job: Job, folder: Path) -> dict[str, pd.DataFrame]:
+    """All rows of a finished run, by the names and in the columns of the results.
+
+    :param job: the run
+    :param folder: of it
+    """
+    final, steps = final_folder(job, folder), job.grid.steps
+    record = json.loads((final / "training.json").read_text())
+    episodes = _in_order(read_text_table(final / "episodes.csv"), job)
+    last = _summary(_typed(episodes)).assign(step=steps)
+    curve = folder / "evaluation.csv"
+    rows = [_earlier(pd.read_csv(curve), steps, job.grid.weathers)] if curve.exists() else []
+    tables = {
+        "evaluations": pd.concat([*rows, last]) if rows and len(rows[0]) else last,
+        "final": last,
+        "episodes": episodes,
+        "runs": pd.DataFrame([{**record, "steps": steps, "settings": settings_column(job)}]),
+    }
+    if (path := final / "weights.csv").exists():
+        tables["weights"] = _in_order(read_text_table(path), job)
+    if job.grid.failures is not None:
+        broken, failures = _in_order(read_text_table(final / "failures.csv"), job), job.grid.failures
+        asked = broken["kind"].isin(failures.kinds) & (broken["severity"] == str(failures.severity))
+        tables["failures"] = broken[asked | (broken["kind"] == HEALTHY["kind"])]
+    return {
+        name: frame.assign(method=job.method, seed=job.seed)[[*FILES[name].columns]] for name, frame in tables.items()
+    }
+
+
+def _earlier(curve: pd.DataFrame, steps: int, weathers: Sequence[str]) -> pd.DataFrame:
+    """The learning curve but for its last point, of which the final evaluation knows more."""
+    numbers = dict.fromkeys(("return_mean", "return_std", "distance_mean", "distance_std"), DIGITS)
+    return curve[(curve["step"] < steps) & curve["weather"].isin(weathers)].round(numbers)
+
+
+def _in_order(rows: pd.DataFrame, job: Job) -> pd.DataFrame:
+    """Rows of the grid's weathers, in its order."""
+    parts = [rows[rows["weather"] == weather] for weather in job.grid.weathers]
+    return pd.concat(parts)
+
+
+def _typed(episodes: pd.DataFrame) -> pd.DataFrame:
+    """Text of ``episodes.csv`` as numbers."""
+    numbers = episodes.replace({"True": "1", "False": "0", "": "nan"})
+    columns = ["return", "distance", "steps", "crashed", "offroad"]
+    return numbers.astype(dict.fromkeys(columns, float))
+
+
+def _rows_of(path: Path, **key: Any) -> pd.DataFrame:
+    """Rows of a stage's file with the given values, as text."""
+    if not path.exists():
+        return pd.DataFrame()
+    rows = read_text_table(path)
+    return rows[_matches(rows, key)]
+
+
+def _matches(rows: pd.DataFrame, key: dict[str, Any]) -> pd.Series[bool]:
+    matches = pd.Series(True, index=rows.index)
+    for column, value in key.items():
+        matches &= rows[column] == str(value)
+    return matches
+
+
+def _replace(path: Path, rows: pd.DataFrame, key: dict[str, Any]) -> None:
+    """Put rows in place of those with the given values."""
+    if path.exists():
+        old = read_text_table(path)
+        rows = pd.concat([old[~_matches(old, key)], rows])
+    write_atomically(path, partial(rows.to_csv, index=False))
+
+
+def steps_done(folder: Path) -> int:
+    """Training steps of a run so far, as its folder tells: those of finished episodes and of the newest checkpoint."""
+    checkpoint = newest_checkpoint(folder)
+    done = 0 if checkpoint is None else checkpoint_step(checkpoint)
+    lived = 0
+    for path in folder.glob("*monitor.csv"):
+        with contextlib.suppress(OSError, ValueError, KeyError):  # just being written
+            lived += int(pd.read_csv(path, skiprows=1)["l"].sum())
+    return max(done, lived)
