@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import EngFormatter
 from numpy.typing import ArrayLike
 
@@ -25,6 +26,10 @@ WIDTH = 9.0
 SMALL, MEDIUM = 9, 10
 PER_PANEL = 7
 """Curves of a panel, the reference not counted: more cannot be told apart."""
+
+
+KEPT = (-1.0, 2.0)
+"""Shares that a figure shows at most: that of a return near zero can be anything."""
 
 
 class Style(NamedTuple):
@@ -52,8 +57,8 @@ STYLES = {
     "tqc": Style("#D55E00", "--", "h", "///"),
     "crossq": Style("#0072B2", "--", "8", "///"),
     "lve": Style("#CC79A7", marker="*"),
-    "lve-paper": Style("#CC79A7", ":", "1", "..."),
-    "have-paper": Style("#000000", ":", "2", "..."),
+    "lve-paper": Style("#CC79A7", ":", "p", "..."),
+    "have-paper": Style("#000000", ":", "p", "..."),
     "have": Style("#000000"),
     "have-dropout": Style("#000000", "--", "H", "///"),
 }
@@ -210,9 +215,8 @@ def plot_profiles(results: Results, measure: Measure = DISTANCE, reference: str 
     """
     methods = results.scored()
     scores = {method: results.scores(method, measure) for method in methods}
-    highest = max(float(table.max()) for table in scores.values())
-    lowest = min(0.0, *(float(table.min()) for table in scores.values()))
-    thresholds = np.linspace(lowest, highest, 201)
+    # the profiles are constant in between
+    thresholds = np.unique(np.concatenate([[0.0], *(table.ravel() for table in scores.values())]))
     others = [method for method in methods if method != reference]
     groups = [others[i : i + PER_PANEL] for i in range(0, len(others), PER_PANEL)] or [[]]
     figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
@@ -222,7 +226,9 @@ def plot_profiles(results: Results, measure: Measure = DISTANCE, reference: str 
             look = style(method)
             profile = performance_profile(scores[method], thresholds)
             width = 2.5 if method == reference else 1.5
-            axis.plot(thresholds, profile, color=look.colour, linestyle=look.line, linewidth=width, label=method)
+            axis.step(
+                thresholds, profile, where="post", color=look.colour, linestyle=look.line, linewidth=width, label=method
+            )
         axis.set(xlabel=f"threshold of {measure.label}", ylim=(-0.03, 1.03))
         axis.grid(alpha=0.3)
         if len(groups) == 1:
@@ -325,7 +331,7 @@ def plot_kept(table: pd.DataFrame, measure: Measure) -> Figure:
     """What every method keeps when a sensor fails: a row for each modality, a group of bars for each kind of failure.
 
     :param table: from :func:`~sb3_have.benchmark.tables.kept_table`
-    :param measure: what is kept
+    :param measure: what is kept; the axis shows no more of it than :data:`KEPT`
     """
     modalities = list(modality_colours(list(set(table["modality"]))))
     methods = ordered(set(table["method"]))
@@ -356,6 +362,8 @@ def plot_kept(table: pd.DataFrame, measure: Measure) -> Figure:
         axis.axhline(1.0, color="0.35", linestyle="--", linewidth=1)
         axis.set(ylabel=f"{measure.name} kept", axisbelow=True)
         axis.grid(axis="y", alpha=0.3)
+    lowest, highest = axes[0].get_ylim()
+    axes[0].set_ylim(max(lowest, KEPT[0]), min(highest, KEPT[1]))
     shown = [method for method in methods if method in handles]
     _legend_above(figure, [handles[method] for method in shown], shown)
     return figure
@@ -374,7 +382,8 @@ def _legend_above(figure: Figure, handles: Sequence[Any], labels: Sequence[str])
 
 
 def _draw_whiskers(axis: Axes, places: Sequence[float], lowest: ArrayLike, highest: ArrayLike) -> None:
-    axis.vlines(places, lowest, highest, color="0.3", linewidth=1.2, zorder=3)
+    outline = withStroke(linewidth=2.6, foreground="white")  # seen on a black bar too
+    axis.vlines(places, lowest, highest, color="0.3", linewidth=1.2, zorder=3, path_effects=[outline])
 
 
 def _seeds(seeds: Sequence[int]) -> str:

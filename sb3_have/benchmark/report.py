@@ -98,11 +98,14 @@ class Report:
         caption = (
             "ER is the return of an episode (episode reward), D the distance driven in it. Mean over seeds and "
             "episodes of the final evaluation with the deterministic policy; number of seeds in brackets. ± is the "
-            "standard deviation of the seeds' means (ddof 1)"
+            "standard deviation of the "
         )
         single = [name for name in self.methods if len(self.results.finished_seeds(name)) == 1]
-        if single:
-            caption += f", but for {_listed(single)}, with a single seed, that of the episodes"
+        if single == self.methods:
+            caption += "episodes: there is a single seed"
+        else:
+            caption += "seeds' means (ddof 1)"
+            caption += f", but for {_listed(single)}, with a single seed, that of the episodes" if single else ""
         if len(self.results["drivers"]):
             names = list(dict.fromkeys(self.results["drivers"]["driver"]))
             caption += f"; {_listed(names)} did not learn, and ± is over episodes"
@@ -205,7 +208,8 @@ class Report:
             f"A sensor fails for whole episodes, at severity {_listed(map(str, severity))} (episodes in each weather: "
             f"{_listed(map(str, episodes))}). Share: mean over the weathers with the failure over that without, in the "
             "same episodes; bars and table: mean of the seeds' shares; whiskers: from the lowest to the highest seed. "
-            "A share of a poor driver is easily high: read it beside Table 1. Numbers: `table_failures.csv`."
+            "A share of a poor driver is easily high: read it beside Table 1. "
+            f"The figures' axes end at {figures.KEPT[0]:.0f} and {figures.KEPT[1]:.0f}. Numbers: `table_failures.csv`."
         )
         parts.append(caption)
         seeds = self.results["failures"].groupby("method")["seed"].nunique()
@@ -281,7 +285,8 @@ def _standing(table: pd.DataFrame, measure: Measure, reference: str, weathers: S
     others = best[~best["weather"].isin(won)]
     if reference in set(table["driver"]):
         text = f"`{reference}` is first in {measure.name} in {len(won)} of {len(weathers)} weathers"
-        told = [f"{row['weather']} (`{row['driver']}`)" for row in others.to_dict("records")]
+        firsts = {driver: list(others.loc[others["driver"] == driver, "weather"]) for driver in others["driver"]}
+        told = [f"{', '.join(lost)} (`{driver}`)" for driver, lost in firsts.items()]
         lines.append(f"{text}; not in {_listed(told)}." if told else f"{text}.")
     return lines
 

@@ -243,7 +243,9 @@ def run_table(results: Results) -> pd.DataFrame:
     for method in results.methods:
         done = results.finished_seeds(method)
         own = every[(every["method"] == method) & ~every["seed"].isin(done)]
-        under_way = {seed: own.loc[own["seed"] == seed, "step"].max() for seed in set(own["seed"])}
+        under_way = {
+            seed: _newest(own[own["seed"] == seed], len(results.weathers)) for seed in sorted(set(own["seed"]))
+        }
         of_runs, expected = runs[runs["method"] == method], results.expected_seeds(method)
         rows.append(
             {
@@ -251,12 +253,19 @@ def run_table(results: Results) -> pd.DataFrame:
                 "parameters": " / ".join(map(str, sorted(set(of_runs["parameters"])))),
                 "steps": " / ".join(map(str, sorted(set(finished.loc[finished["method"] == method, "step"])))),
                 "finished": ", ".join(map(str, done)),
-                "under_way": ", ".join(f"{seed} (at {step})" for seed, step in sorted(under_way.items())),
+                "under_way": ", ".join(f"{seed} ({state})" for seed, state in under_way.items()),
                 "not_begun": ", ".join(str(s) for s in expected if s not in done and s not in under_way),
                 "minutes": round(of_runs["minutes"].mean(), 1) if len(of_runs) else np.nan,
             }
         )
     return pd.DataFrame(rows)
+
+
+def _newest(rows: pd.DataFrame, weathers: int) -> str:
+    """The step of a run's newest evaluation, and in how many weathers it is if not in all."""
+    step = rows["step"].max()
+    known = rows.loc[rows["step"] == step, "weather"].nunique()
+    return f"at {step}" if known == weathers else f"at {step}, {known} of {weathers} weathers"
 
 
 def run_markdown(table: pd.DataFrame) -> str:
