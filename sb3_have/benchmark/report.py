@@ -119,7 +119,9 @@ class Report:
             return ["## Table 2: the parts of HAVE", f"Needs finished runs of two of {_listed(tables.ABLATION)}."]
         self._save_table("ablation", table)
         absent = [name for name in tables.ABLATION if name not in set(table["method"]) and name != "gve"]
-        caption = "Over all weathers; mean and ± as in Table 1. Parameters are those of the whole model."
+        caption = (
+            "Over all weathers; mean and ± as in Table 1. Parameters: all that is trained, target networks left out."
+        )
         caption += f" Without a finished run: {_listed(absent)}." if absent else ""
         caption += " Numbers: `table_ablation.csv`."
         return ["## Table 2: the parts of HAVE", tables.ablation_markdown(self.results, table), caption]
@@ -278,16 +280,20 @@ def _standing(table: pd.DataFrame, measure: Measure, reference: str, weathers: S
     table = table[table["measure"] == measure.name]
     overall = table[(table["weather"] == tables.ALL) & (table["seeds"] > 0)].sort_values("mean", ascending=False)
     unit = f" {measure.unit}" if measure.unit else ""
-    levels = [f"`{r['driver']}` {r['mean']:.{measure.digits}f}{unit}" for r in overall.to_dict("records")]
+    levels = [f"`{row['driver']}` {row['mean']:.{measure.digits}f}{unit}" for row in overall.to_dict("records")]
     lines = [f"Mean {measure.name} over the weathers, best first: {', '.join(levels)}."]
+    told = table[(table["weather"] == tables.ALL) & (table["seeds"] == 0)].to_dict("records")
+    if told:
+        levels = [f"`{row['driver']}` {row['mean']:.{measure.digits}f}{unit}" for row in told]
+        lines.append(f"Drivers that did not learn: {', '.join(levels)}.")
     best = table[table["best"] & (table["weather"] != tables.ALL)]
     won = best.loc[best["driver"] == reference, "weather"]
     others = best[~best["weather"].isin(won)]
     if reference in set(table["driver"]):
         text = f"`{reference}` is first in {measure.name} in {len(won)} of {len(weathers)} weathers"
         firsts = {driver: list(others.loc[others["driver"] == driver, "weather"]) for driver in others["driver"]}
-        told = [f"{', '.join(lost)} (`{driver}`)" for driver, lost in firsts.items()]
-        lines.append(f"{text}; not in {_listed(told)}." if told else f"{text}.")
+        losses = [f"{', '.join(lost)} (`{driver}`)" for driver, lost in firsts.items()]
+        lines.append(f"{text}; not in {_listed(losses)}." if losses else f"{text}.")
     return lines
 
 

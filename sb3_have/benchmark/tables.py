@@ -17,10 +17,10 @@ ALL = "all"
 ABLATION = {
     "deepmdp": "one critic of all features (GVE)",
     "gve": "one critic of all features (GVE)",
-    "gve-wide": "the same, as many parameters as HAVE",
+    "gve-wide": "the same, its critic as large as HAVE's",
     "lve": "a critic for each modality, weighted (LVE)",
     "have": "both, mixed by the re-fusion network",
-    "lve-paper": "LVE with Eq. 10 as printed",
+    "lve-paper": "LVE, only the weighted sum supervised",
     "have-paper": "HAVE with Eq. 10 as printed",
     "have-dropout": "HAVE with modality dropout in training",
 }
