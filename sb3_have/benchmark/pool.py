@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +41,7 @@ class RayPool:
         gpus: float = 0.0,
         keep_checkpoints: bool = False,
     ) -> None:
-        for name, value in ENVIRONMENT.items():
-            os.environ.setdefault(name, value)
+        os.environ.update(ENVIRONMENT)
         try:
             import ray
         except ModuleNotFoundError:
@@ -49,7 +49,13 @@ class RayPool:
         quiet: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
         if address is None:
             quiet |= {"num_cpus": workers, "include_dashboard": False, "object_store_memory": OBJECT_STORE}
-        ray.init(address=address, **quiet)
+        # A SIGTERM to the whole process group (timeout sends one) must find Ray alive: the runs are to save first. The
+        # mask is inherited by Ray's processes; Ctrl-C is masked there by Ray itself.
+        signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
+        try:
+            ray.init(address=address, **quiet)
+        finally:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
         self._ray = ray
         self.workers = workers or int(ray.cluster_resources().get("CPU", 1))  # type: ignore[no-untyped-call]
         # A process of its own for every run: what one leaves behind (threads, a grown heap) is no burden to the next.

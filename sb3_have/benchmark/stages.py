@@ -106,10 +106,11 @@ def trained(job: Job, folder: Path, device: str) -> OffPolicyAlgorithm | None:
     record = final_folder(job, folder) / "training.json"
     if record.exists():
         return _reload(job, folder, json.loads(record.read_text()), device)
-    if newest_checkpoint(folder) is None and (earlier := [*folder.glob("final-*/training.json")]):
+    if newest_checkpoint(folder) is None and (folder / "model.zip").exists():
+        # training would begin anew, over what is there
         raise ValueError(
-            f"{folder} is a finished run of other length ({earlier[0].parent.name}) without its checkpoint, so it "
-            "cannot go on; choose another --runs (and --keep-checkpoints, for runs that will be made longer)"
+            f"{folder} is of a run that ended elsewhere and has no checkpoint to go on from; choose another --runs, or "
+            "remove it (--keep-checkpoints leaves them to runs that will be made longer)"
         )
     grid = job.grid
     run = Run(

@@ -1,0 +1,17 @@
+"""A wrapper that gives others the time to interfere with a run."""
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+
+
+class SlowUntil(gym.Wrapper[Any, Any, Any, Any]):
+    """Takes its time for every step until the file named in the environment variable ``HURRY`` is there."""
+
+    def step(self, action: Any) -> Any:
+        if not Path(os.environ["HURRY"]).exists():
+            time.sleep(0.1)
+        return super().step(action)
