@@ -1,10 +1,11 @@
-"""Environments. Importing this package registers ``HighwayVision-v0`` and ``CarlaVision-v0`` with gymnasium."""
+"""Environments; importing this package registers them: HighwayVision-v0, CarlaVision-v0 and ReliabilityDrive-v0."""
 
 from gymnasium.envs.registration import WrapperSpec, register, registry
 
 from sb3_have.envs.highway_vision import HighwayVisionEnv
+from sb3_have.envs.reliability_drive import ReliabilityDriveEnv
 
-__all__ = ["HighwayVisionEnv"]
+__all__ = ["HighwayVisionEnv", "ReliabilityDriveEnv"]
 
 if "HighwayVision-v0" not in registry:
     register(
@@ -23,3 +24,6 @@ if "CarlaVision-v0" not in registry:
         kwargs={"max_episode_steps": None},
         additional_wrappers=(WrapperSpec("ReportTimeout", "sb3_have.envs.highway_vision:ReportTimeout", {}),),
     )
+
+if "ReliabilityDrive-v0" not in registry:
+    register(id="ReliabilityDrive-v0", entry_point="sb3_have.envs.reliability_drive:ReliabilityDriveEnv")

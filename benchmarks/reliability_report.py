@@ -1,0 +1,93 @@
+"""Statistics of the runs of the reliability benchmark, as a Markdown page."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import pandas as pd
+
+from sb3_have.common.evaluation import Interval, iqm, mean, probability_of_improvement, stratified_bootstrap
+
+REFERENCE = "have"
+SCORES = {"final_return": "final return", "area": "area under the curve"}
+MEASURES = {
+    "weight_auc": "weight AUC",
+    "weight_auc_in_step": "weight AUC in a step",
+    "value_bias": "bias of Q",
+    "value_correlation": "correlation of Q",
+    "negative_gradient": "dH/dq < 0",
+    "clean_return": "clean return",
+    "kept_black": "kept: black",
+    "kept_frozen": "kept: frozen",
+    "kept_noise": "kept: noise",
+}
+
+
+def report(rows: pd.DataFrame) -> str:
+    """
+    :param rows: method, seed, updates, measure, value
+    :return: tables of the scores (interquartile mean over seeds), of the probability that a run of "have" is better
+        than one of another method, and of the other measures (mean over seeds), with 95% bootstrap intervals
+    """
+    methods = list(dict.fromkeys(rows["method"]))
+    n_seeds = rows.groupby("method")["seed"].nunique()
+    lines = ["## Scores: interquartile mean over seeds [95% interval], and mean ± standard deviation", ""]
+    header = ["method", "seeds", *(f"{title} {kind}" for title in SCORES.values() for kind in ("IQM", "mean"))]
+    table = []
+    for method in methods:
+        cells = [method, str(n_seeds[method])]
+        for measure in SCORES:
+            scores = values(rows, method, measure)
+            cells += [interval(scores, iqm, digits=1), f"{scores.mean():.1f} ± {scores.std(ddof=0):.1f}"]
+        table.append(cells)
+    lines += markdown(header, table)
+    if REFERENCE in methods:
+        lines += ["", f"## Probability that a run of {REFERENCE} is better [95% interval]", ""]
+        others = [method for method in methods if method != REFERENCE]
+        lines += markdown(
+            ["than", *SCORES.values()],
+            [[method, *(_improvement(rows, method, m) for m in SCORES)] for method in others],
+        )
+    lines += ["", "## What the weights and the values are worth: mean over seeds [95% interval]", ""]
+    table = [[method, *(interval(values(rows, method, m), mean) for m in MEASURES)] for method in methods]
+    return "\n".join([*lines, *markdown(["method", *MEASURES.values()], table), ""])
+
+
+def values(rows: pd.DataFrame, method: str, measure: str) -> pd.Series[float]:
+    """Of one measure, a number per seed, without seeds where the method has none."""
+    chosen = rows[(rows["method"] == method) & (rows["measure"] == measure)]
+    return chosen.set_index("seed")["value"].astype(float).dropna().sort_index()
+
+
+def interval(scores: pd.Series[float], statistic: object, digits: int = 3) -> str:
+    if scores.empty:
+        return "-"
+    if len(scores) == 1:
+        return f"{scores.iloc[0]:.{digits}f}"
+    return _format(stratified_bootstrap(statistic, scores.to_numpy()[:, None]), digits)  # type: ignore[arg-type]
+
+
+def _improvement(rows: pd.DataFrame, method: str, measure: str) -> str:
+    better, other = (values(rows, name, measure).to_numpy()[:, None] for name in (REFERENCE, method))
+    if min(len(better), len(other)) < 2:
+        return "-"
+    return _format(stratified_bootstrap(probability_of_improvement, better, other), 2)
+
+
+def _format(result: Interval, digits: int) -> str:
+    return f"{result.estimate:.{digits}f} [{result.lower:.{digits}f}, {result.upper:.{digits}f}]"
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    """Lines of a Markdown table."""
+    return ["| " + " | ".join(cells) + " |" for cells in [header, ["---"] * len(header), *rows]]
+
+
+def curves(rows: pd.DataFrame) -> Mapping[str, pd.DataFrame]:
+    """Learning curves: by method, a row per number of updates and a column per seed."""
+    points = rows[rows["measure"].str.fullmatch(r"return_\d+")]
+    points = points.assign(updates=points["measure"].str.removeprefix("return_").astype(int))
+    return {
+        str(method): group.pivot(index="updates", columns="seed", values="value")
+        for method, group in points.groupby("method", sort=False)
+    }

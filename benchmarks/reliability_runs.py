@@ -1,0 +1,266 @@
+"""One run of the reliability benchmark: a method is trained on ReliabilityDrive-v0 by HAVESAC, and measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+import torch as th
+from numpy.typing import NDArray
+
+from benchmarks.known_q import Floats, auc
+from benchmarks.reliability_vec_env import ReliabilityDriveVecEnv
+from sb3_have import HAVESAC
+from sb3_have.envs.reliability_drive import CONDITIONS
+
+METHODS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {
+        "gve": {"value_estimation": "gve"},
+        "gve-wide": {"value_estimation": "gve"},  # and wider hidden layers, see `gve_width`
+        "lve": {"value_estimation": "lve"},
+        "have": {},
+        "have-dropout": {"modality_dropout": 0.2},
+        "have-unsupervised": {"local_coef": 0.0},
+        "have-monotone": {"refusion": "monotone"},
+        "lve-unsupervised": {"value_estimation": "lve", "local_coef": 0.0},
+        "gve-wide-dropout": {"value_estimation": "gve", "modality_dropout": 0.2},
+    }
+)
+"""What a method gives to HAVESAC; all else is the same for all."""
+N_MODALITIES = 3
+N_ENVS = 8
+UPDATES_PER_STEP = 4
+"""Updates for each step of all environments."""
+WARM_UP = 100
+"""Steps of all environments by random actions."""
+WIDTH = 64
+HYPERPARAMETERS: Mapping[str, Any] = MappingProxyType(
+    {
+        "learning_rate": 1e-3,
+        "gamma": 0.98,
+        "tau": 0.01,
+        "batch_size": 64,
+        "buffer_size": 50_000,
+        "policy_delay": 2,
+        "ent_coef": "auto_0.1",
+        "auxiliary": None,
+        "train_freq": 1,
+        "gradient_steps": UPDATES_PER_STEP,
+        "learning_starts": WARM_UP * N_ENVS,
+    }
+)
+N_EVALUATIONS = 8
+N_EPISODES = 24
+"""Episodes of an evaluation, all at once, the same for every method and seed of training."""
+EVALUATION_SEED = 1_000_000
+FAILURES = CONDITIONS[1:]
+
+
+@dataclass
+class Drive:
+    """Episodes of one policy: S steps each of N drives; what comes after an episode's end is masked."""
+
+    rewards: Floats
+    """(S, N), 0 after the end."""
+    alive: NDArray[np.bool_]
+    """(S, N): whether the step belongs to the episode."""
+    reliable: NDArray[np.bool_]
+    """(S, N, d), when the action was chosen."""
+    weights: Floats | None
+    """(S, N, d), of the modalities, or None where the method has none."""
+
+    @property
+    def returns(self) -> Floats:
+        """(N,)."""
+        total: Floats = self.rewards.sum(axis=0)
+        return total
+
+    def weight_auc(self) -> float:
+        """
+        The weights as detectors of sound modalities: the probability that a sound modality has a larger weight than a
+        failed one, each drawn from all steps of all episodes.
+        """
+        if self.weights is None:
+            return float("nan")
+        return auc(self.weights[self.alive].ravel(), self.reliable[self.alive].ravel())
+
+    def weight_auc_in_step(self) -> float:
+        """The same, of a sound and a failed modality of the same step."""
+        if self.weights is None:
+            return float("nan")
+        weights, reliable = self.weights[self.alive], self.reliable[self.alive]
+        pairs = reliable[:, :, None] & ~reliable[:, None, :]
+        difference = weights[:, :, None] - weights[:, None, :]
+        return float(((difference > 0) + 0.5 * (difference == 0))[pairs].mean())
+
+
+def make_model(method: str, seed: int, **kwargs: Any) -> HAVESAC:
+    """
+    :param method: one of ``METHODS``
+    :param seed: of networks, environments and exploration
+    :param kwargs: of HAVESAC, in place of the method's own
+    """
+    settings = {**HYPERPARAMETERS, **METHODS[method], "policy_kwargs": policy_kwargs(WIDTH)}
+    if method.startswith("gve-wide"):
+        settings["policy_kwargs"] = policy_kwargs(gve_width())
+    env = ReliabilityDriveVecEnv(N_ENVS, n_modalities=N_MODALITIES)
+    return HAVESAC("MultiInputPolicy", env, seed=seed, device="cpu", **{**settings, **kwargs})
+
+
+def policy_kwargs(width: int) -> dict[str, Any]:
+    """Of HAVESAC's policy, with this width of the critics' hidden layers."""
+    return {"features_dim": 32, "net_arch": {"pi": [WIDTH, WIDTH], "qf": [width, width]}}
+
+
+def critic_size(width: int, value_estimation: str) -> int:
+    """Parameters of the encoders and critics with this width of the critics' hidden layers."""
+    model = make_model("have", 0, value_estimation=value_estimation, policy_kwargs=policy_kwargs(width))
+    return sum(parameter.numel() for parameter in model.critic.parameters())
+
+
+@cache
+def gve_width() -> int:
+    """Width of the hidden layers with which a global critic alone has as many parameters as HAVE's, within 1%."""
+    wanted = critic_size(WIDTH, "have")
+    low, high = WIDTH, 16 * WIDTH
+    while low < high:
+        middle = (low + high) // 2
+        low, high = (middle + 1, high) if critic_size(middle, "gve") < wanted else (low, middle)
+    assert abs(critic_size(low, "gve") / wanted - 1) < 0.01
+    return low
+
+
+def run(method: str, seed: int, n_updates: int) -> dict[str, float]:
+    """
+    Trains one method and measures it.
+
+    :param method: one of ``METHODS``
+    :param seed: of the training; the episodes of the evaluations are the same for all
+    :param n_updates: of the critic
+    :return: measures by name, NaN where a method has no such part:
+        ``return_<n>`` mean return after n updates, ``final_return`` the last of them and ``area`` their mean;
+        ``weight_auc`` and ``weight_auc_in_step``, see :class:`Drive`;
+        ``value_bias`` and ``value_correlation``, see :func:`value_errors`; ``negative_gradient``, see there;
+        ``clean_return`` with all modalities sound, and ``kept_black``, ``kept_frozen``, ``kept_noise``, the share of it
+        that is left when one modality fails so for whole episodes, mean over the modalities;
+        ``parameters`` of encoders and critics
+    """
+    th.set_num_threads(1)
+    model = make_model(method, seed)
+    measures: dict[str, float] = {}
+    for i in range(N_EVALUATIONS):
+        due = n_updates * (i + 1) // N_EVALUATIONS
+        steps = (due - model._n_updates) // UPDATES_PER_STEP + (WARM_UP if i == 0 else 0)
+        model.learn(steps * N_ENVS, reset_num_timesteps=i == 0)
+        drive = evaluate(model)
+        measures[f"return_{due}"] = float(drive.returns.mean())
+    measures["final_return"] = list(measures.values())[-1]
+    measures["area"] = float(np.mean(list(measures.values())[:N_EVALUATIONS]))
+    measures |= {"weight_auc": drive.weight_auc(), "weight_auc_in_step": drive.weight_auc_in_step()}
+    bias, correlation = value_errors(model)
+    measures |= {"value_bias": bias, "value_correlation": correlation, "negative_gradient": negative_gradient(model)}
+    return {**measures, **kept_returns(model), "parameters": sum(p.numel() for p in model.critic.parameters())}
+
+
+def evaluate(model: HAVESAC, n_episodes: int = N_EPISODES, seed: int = EVALUATION_SEED, **options: Any) -> Drive:
+    """
+    Drives whole episodes by the mode of the policy.
+
+    :param model: trained with ``N_MODALITIES`` modalities
+    :param n_episodes: side by side
+    :param seed: of the first, the next ones count on
+    :param options: of the environment, e.g. ``failure``
+    """
+    env = ReliabilityDriveVecEnv(n_episodes, n_modalities=N_MODALITIES, **options)
+    env.seed(seed)
+    observation = env.reset()
+    assert isinstance(observation, dict)
+    alive = np.ones(n_episodes, bool)
+    rows: list[tuple[Floats, NDArray[np.bool_], NDArray[np.bool_], Floats]] = []
+    while alive.any():
+        with th.no_grad():
+            features = model.policy.encode({key: th.as_tensor(value) for key, value in observation.items()})
+            actions = model.actor(features.flatten(start_dim=1), deterministic=True).numpy()
+            weights = np.empty(0) if _is_gve(model) else model.critic.weights(features).numpy()
+        reliable = env.batch.reliable.copy()
+        observation, rewards, dones, _ = env.step(actions)
+        assert isinstance(observation, dict)
+        rows.append((rewards * alive, alive.copy(), reliable, weights))
+        alive &= ~dones
+    rewards, steps, reliable, weights = (np.stack(column) for column in zip(*rows, strict=True))
+    return Drive(rewards, steps, reliable, None if _is_gve(model) else weights)
+
+
+def kept_returns(model: HAVESAC) -> dict[str, float]:
+    """``clean_return``, and for each kind of failure the share of it that is kept, see :func:`run`."""
+    clean = float(evaluate(model, corruption=0.0).returns.mean())
+    measures = {"clean_return": clean}
+    for kind in FAILURES:
+        returns = [
+            evaluate(model, corruption=0.0, failure=(modality, kind)).returns.mean() for modality in range(N_MODALITIES)
+        ]
+        measures[f"kept_{kind}"] = float(np.mean(returns)) / clean
+    return measures
+
+
+def value_errors(model: HAVESAC, n_episodes: int = N_EPISODES, n_steps: int = 200) -> tuple[float, float]:
+    """
+    The critic against Monte-Carlo returns of the policy that it evaluates, the stochastic one with its entropy:
+    G_t = r_t + gamma (1 - end_t) (G_{t+1} - alpha log pi(a_{t+1})).
+
+    Of episodes of up to 2 ``n_steps`` steps the first half counts. Where they are cut, G is the critic's own value,
+    which enters what counts by gamma^n_steps (0.02).
+
+    :return: bias, the mean of min_k Q_k - G over the standard deviation of G, and Pearson's correlation
+    """
+    env = ReliabilityDriveVecEnv(n_episodes, n_modalities=N_MODALITIES, max_episode_steps=2 * n_steps + 1)
+    env.seed(EVALUATION_SEED)
+    observation = env.reset()
+    alpha = float(th.exp(model.log_ent_coef.detach())) if model.log_ent_coef is not None else 0.0
+    alive = np.ones(n_episodes, bool)
+    rows = []
+    generator_state = th.get_rng_state()
+    th.manual_seed(EVALUATION_SEED)
+    for _ in range(2 * n_steps):
+        assert isinstance(observation, dict)
+        with th.no_grad():
+            features = model.policy.encode({key: th.as_tensor(value) for key, value in observation.items()})
+            actions, log_prob = model.actor.action_log_prob(features.flatten(start_dim=1))
+            q = model.critic.values(features, actions).q.min(dim=0).values.numpy()
+        observation, rewards, dones, _ = env.step(actions.numpy())
+        rows.append((q, -alpha * log_prob.numpy(), rewards, alive.copy(), dones))
+        alive &= ~dones
+    th.set_rng_state(generator_state)
+    q, bonus, rewards, lived, dones = (np.stack(column) for column in zip(*rows, strict=True))
+    returns = np.empty_like(q)
+    returns[-1] = q[-1]
+    for t in range(len(q) - 2, -1, -1):
+        returns[t] = rewards[t] + model.gamma * ~dones[t] * (bonus[t + 1] + returns[t + 1])
+    q, returns = q[:n_steps][lived[:n_steps]], returns[:n_steps][lived[:n_steps]]
+    return float((q - returns).mean() / returns.std()), float(np.corrcoef(q, returns)[0, 1])
+
+
+def negative_gradient(model: HAVESAC, n_samples: int = 2000) -> float:
+    """
+    Share of sampled transitions (and twins) in which the value falls as the global or the weighted local value rises.
+    """
+    if model.critic.value_estimation != "have":
+        return float("nan")
+    assert model.replay_buffer is not None
+    batch = model.replay_buffer.sample(n_samples)
+    with th.no_grad():
+        features = model.policy.encode(batch.observations)
+        values = model.critic.values(features, batch.actions)
+    assert values.q_global is not None and values.q_lve is not None
+    inputs = [values.q_global.requires_grad_(), values.q_lve.requires_grad_()]
+    mixed = model.critic.refusion(*inputs, features)
+    gradients = th.stack(th.autograd.grad(mixed.sum(), inputs))
+    return float((gradients < 0).any(dim=0).float().mean())
+
+
+def _is_gve(model: HAVESAC) -> bool:
+    return model.critic.value_estimation == "gve"
