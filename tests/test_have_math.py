@@ -53,6 +53,22 @@ def test_losses_and_their_gradients(case: tuple[str, str, str, float]) -> None:
     assert_gradients(model, reference)
 
 
+@pytest.mark.parametrize(
+    "estimation, refusion, equal",
+    [("lve", "free", True), ("gve", "free", True), ("have", "convex", True), ("have", "free", False)],
+)
+def test_where_the_papers_target_is_the_bellman_target(estimation: str, refusion: str, equal: bool) -> None:
+    """Where nothing is re-fused, bit by bit; with convex re-fusion but for rounding; with the paper's not at all."""
+    losses = []
+    for target in ("bellman", "paper"):
+        model = make_model(estimation, refusion, target, 0.0)
+        draw_noise()
+        model.train(1, BATCH)
+        losses.append(model.logger.name_to_value["train/critic_loss"])
+    assert losses[0] == losses[1] or estimation == "have"
+    assert (losses[0] == pytest.approx(losses[1], rel=1e-5)) is equal
+
+
 @pytest.mark.parametrize("refusion", ["convex", "monotone", "free"])
 def test_parts_of_the_value(refusion: str) -> None:
     """``decompose`` and the critic's call: local and global values, weights (Eq. 9), LVE (Eq. 6), H (3.4)."""

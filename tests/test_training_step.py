@@ -116,7 +116,16 @@ class ReadsOfTensors(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-@pytest.mark.parametrize("options", [{}, {"modality_dropout": 0.3, "policy_delay": 2}, {"target": "paper"}], ids=str)
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"modality_dropout": 0.3, "policy_delay": 2},
+        {"target": "paper"},
+        {"random_shift": 4, "n_augmentations": 2},
+    ],
+    ids=str,
+)
 def test_no_update_reads_a_tensor(monkeypatch: pytest.MonkeyPatch, options: dict[str, Any]) -> None:
     monkeypatch.setattr(th.distributions.Distribution, "_validate_args", False)  # as on a GPU
     model = tiny_model(sensors_space(), **options)

@@ -194,9 +194,10 @@ def test_gradient_steps_and_learning_rate_schedule() -> None:
     assert [optimizer.param_groups[0]["lr"] for optimizer in optimizers if optimizer] == [0.25e-3] * 3
 
 
-def test_every_observation_is_encoded_once() -> None:
+@pytest.mark.parametrize("options", [{}, {"random_shift": 4, "n_augmentations": 2}], ids=str)
+def test_every_observation_is_encoded_once(options: dict[str, Any]) -> None:
     """The encoder is the cost of an update: obs once by the critic's, next_obs once by the target's."""
-    model = tiny_model(vectors_space())
+    model = tiny_model(sensors_space(), **options)
     fill_buffer(model, 20)
     calls = {"critic": 0, "target": 0}
 
