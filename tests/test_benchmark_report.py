@@ -511,12 +511,24 @@ def test_weathers_that_others_win_are_told(tmp_path: Path) -> None:
     runs = {"have": {0: (150, 100)}, "sac": {0: (100, 200)}}
     report = write_report(write(tmp_path / "a", final=final(runs))).read_text()
     assert f"`have` is first in distance in 1 of 2 weathers; not in {NIGHT} (`sac`)." in report
+    level: Runs = {"have": {0: (150, 100)}, "sac": {0: (150, 100)}}
+    report = write_report(write(tmp_path / "b", final=final(level))).read_text()
+    assert "`have` is first or level in distance in 2 of 2 weathers." in report
 
 
 def test_same_results_same_bytes(tmp_path: Path) -> None:
     folder = write(tmp_path / "core", evaluations=evaluations())
     first, second = (write_report(folder, tmp_path / out).parent / "learning_curves.png" for out in ("a", "b"))
     assert first.read_bytes() == second.read_bytes()
+
+
+@pytest.mark.usefixtures("words_only")
+def test_intervals_in_words(tmp_path: Path) -> None:
+    seeds = {"have": (30, 50), "rgb": (10, 20), "sac": (40, 41), "lve": (60, 70)}
+    runs: Runs = {name: {0: (a, a), 1: (b, b)} for name, (a, b) in seeds.items()}
+    report = write_report(write(tmp_path / "a", final=final({**runs, "drq": {0: (1, 1)}}))).read_text()
+    told = "above 0.5 for `rgb`; including 0.5 for `sac`; below 0.5 for `lve`; not known for want of seeds for `drq`"
+    assert f"Probability that `have` is better in distance, its 95% interval: {told}." in report
 
 
 def test_settings_by_dotted_names() -> None:

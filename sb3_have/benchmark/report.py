@@ -290,7 +290,9 @@ def _standing(table: pd.DataFrame, measure: Measure, reference: str, weathers: S
     won = best.loc[best["driver"] == reference, "weather"]
     others = best[~best["weather"].isin(won)]
     if reference in set(table["driver"]):
-        text = f"`{reference}` is first in {measure.name} in {len(won)} of {len(weathers)} weathers"
+        level = sum(best["weather"].isin(won)) > len(won)
+        text = f"`{reference}` is first{' or level' if level else ''} in {measure.name}"
+        text += f" in {len(won)} of {len(weathers)} weathers"
         firsts = {driver: list(others.loc[others["driver"] == driver, "weather"]) for driver in others["driver"]}
         losses = [f"{', '.join(lost)} (`{driver}`)" for driver, lost in firsts.items()]
         lines.append(f"{text}; not in {_listed(losses)}." if losses else f"{text}.")
@@ -305,7 +307,7 @@ def _improvements(scores: pd.DataFrame, measure: Measure, reference: str) -> lis
     unknown = rows["improvement_lower"].isna()
     groups = {
         "above 0.5": rows["improvement_lower"] > 0.5,
-        "on both sides of 0.5": (rows["improvement_lower"] <= 0.5) & (rows["improvement_upper"] >= 0.5),
+        "including 0.5": (rows["improvement_lower"] <= 0.5) & (rows["improvement_upper"] >= 0.5),
         "below 0.5": rows["improvement_upper"] < 0.5,
         "not known for want of seeds": unknown,
     }
