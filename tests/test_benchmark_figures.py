@@ -1,0 +1,186 @@
+"""Figures of a benchmark: what is drawn is what the runs wrote."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmark_results import (
+    DISTANCES,
+    NIGHT,
+    NOON,
+    evaluations,
+    failure_rows,
+    final,
+    moments,
+    read,
+    run_rows,
+    weight_rows,
+)
+from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
+from matplotlib.container import BarContainer
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.text import Text
+
+from sb3_have.benchmark import figures, tables
+from sb3_have.benchmark.reading import RETURN, Results
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Results:
+    return read(tmp_path / "core", final=final(), evaluations=evaluations(), runs=run_rows())
+
+
+def line(axis: Axes, label: str) -> Line2D:
+    (found,) = [line for line in axis.get_lines() if str(line.get_label()) == label]
+    return found
+
+
+def points(drawn: Line2D) -> list[tuple[float, float]]:
+    return [(float(x), float(y)) for x, y in np.column_stack([drawn.get_xdata(), drawn.get_ydata()])]
+
+
+def panel(figure: Figure, words: str) -> Axes:
+    (found,) = [axis for axis in figure.axes if words in axis.get_xlabel() + axis.get_ylabel() + axis.get_title()]
+    return found
+
+
+def bars(axis: Axes) -> dict[str, list[float]]:
+    """Heights of the bars by colour."""
+    groups = [group for group in axis.containers if isinstance(group, BarContainer)]
+    return {to_hex(group.patches[0].get_facecolor()): [bar.get_height() for bar in group.patches] for group in groups}
+
+
+def whiskers(axis: Axes) -> list[list[float]]:
+    """Lowest and highest of each."""
+    paths = [np.asarray(path.vertices, float) for group in axis.collections for path in group.get_paths()]
+    return [[float(y) for y in path[:, 1]] for path in paths]
+
+
+def test_learning_curves_are_means_of_weathers_with_the_range_of_seeds(results: Results) -> None:
+    figure = figures.plot_learning_curves(results)
+    distance, ret = panel(figure, "distance"), panel(figure, "return")
+    assert points(line(distance, "have (2)")) == [(1000, 111.25), (2000, 222.5)]
+    assert points(line(distance, "sac (2)")) == [(1000, 75), (2000, 150)]
+    assert points(line(ret, "have (2)"))[1][1] == pytest.approx(17.25)
+    band = np.asarray(distance.collections[1].get_paths()[0].vertices, float)
+    assert {(float(x), float(y)) for x, y in band} == {(1000, 85), (1000, 137.5), (2000, 170), (2000, 275)}
+    assert to_hex(line(distance, "have (2)").get_color()) == "#000000"
+
+
+def test_learning_curves_leave_out_seeds_that_lag_behind(tmp_path: Path) -> None:
+    rows = evaluations({"have": {0: (100, 200)}}) + evaluations({"have": {1: (1000, 2000)}}, {1000: 1.0})
+    rows += evaluations({"have": {0: (999,)}}, {3000: 1.0})  # not yet in every weather
+    figure = figures.plot_learning_curves(read(tmp_path, evaluations=rows))
+    assert points(line(panel(figure, "distance"), "have (1)")) == [(1000, 75), (2000, 150)]
+    assert not panel(figure, "distance").collections  # a single seed has no band
+
+
+def test_learning_curves_of_many_methods_share_the_reference(tmp_path: Path) -> None:
+    methods = ["have", *(f"method{i}" for i in range(9))]
+    rows = evaluations({name: {0: (i, i)} for i, name in enumerate(methods)})
+    figure = figures.plot_learning_curves(read(tmp_path, evaluations=rows))
+    drawn = [[str(line.get_label()) for line in axis.get_lines()] for axis in figure.axes]
+    assert [len(names) for names in drawn] == [8, 8, 3, 3] and all("have (1)" in names for names in drawn)
+
+
+def test_drivers_are_levels_unless_far_above(tmp_path: Path) -> None:
+    drivers = [{"driver": d, "weather": NOON, **moments(x)} for d, x in (("random", 50), ("IDM", 2134))]
+    figure = figures.plot_learning_curves(read(tmp_path, evaluations=evaluations(), drivers=drivers))
+    axis = panel(figure, "distance")
+    assert {y for _, y in points(line(axis, "random"))} == {50}
+    assert axis.get_title() == "above: IDM 2134" and axis.get_ylim()[1] < 400
+
+
+def test_intervals_are_drawn_where_they_are(tmp_path: Path) -> None:
+    results = read(tmp_path, final=final({**DISTANCES, "lve": {0: (160, 180)}}))
+    table = tables.score_table(results)
+    axis = panel(figures.plot_scores(results, table=table), "IQM of distance")
+    assert [tick.get_text() for tick in axis.get_yticklabels()] == ["sac (2)", "lve (1)", "have (2)"]
+    rows = table[table["measure"] == "distance"].set_index("method")
+    bounds = [points(drawn) for drawn in axis.get_lines() if len(points(drawn)) == 2]
+    assert bounds == [
+        [(rows.loc[name, "iqm_lower"], place), (rows.loc[name, "iqm_upper"], place)]
+        for name, place in (("sac", 0), ("have", 2))
+    ]
+    dots = [drawn for drawn in axis.get_lines() if len(points(drawn)) == 1]
+    assert [points(dot)[0] for dot in dots] == [(150, 0), (170, 1), (220, 2)]
+    assert [to_hex(dot.get_markerfacecolor()) == "#ffffff" for dot in dots] == [False, True, False]
+
+
+def test_improvement_is_drawn_beside_one_half(results: Results) -> None:
+    axis = panel(figures.plot_improvement(results), "in distance")
+    assert [tick.get_text() for tick in axis.get_yticklabels()] == ["sac (2)"]
+    half = [drawn for drawn in axis.get_lines() if drawn.get_linestyle() == "--"]
+    assert [points(drawn) for drawn in half] == [[(0.5, 0), (0.5, 1)]]
+    assert [points(drawn) for drawn in axis.get_lines() if len(points(drawn)) == 1] == [[(0.875, 0)]]
+    with pytest.raises(ValueError, match="'lve'"):
+        figures.plot_improvement(results, "lve")
+
+
+def test_profiles_fall_at_the_scores(results: Results) -> None:
+    axis = figures.plot_profiles(results).axes[0]
+    drawn = line(axis, "have")
+    assert drawn.get_drawstyle() == "steps-post"
+    shares = dict(points(drawn))
+    assert [shares[x] for x in (0, 140, 150, 190, 200, 250, 300)] == [1, 1, 0.75, 0.5, 0.5, 0.25, 0]
+
+
+def test_weights_by_weather(tmp_path: Path) -> None:
+    rows = weight_rows({0: [0.2, 0.4], 1: [0.5]}) + weight_rows({0: [0.9]}, weather=NOON)
+    figure = figures.plot_weather_weights(read(tmp_path, final=final(), weights=rows))
+    (axis,) = figure.axes
+    assert axis.get_title() == "have, mean of seeds 0, 1"
+    # the seeds' means at night are 0.3 and 0.5
+    assert bars(axis)["#d55e00"] == pytest.approx([0.9, 0.4]) and bars(axis)["#0072b2"] == pytest.approx([0.1, 0.6])
+    np.testing.assert_allclose(whiskers(axis), [[0.9, 0.9], [0.3, 0.5], [0.1, 0.1], [0.5, 0.7]])
+    assert [tick.get_text() for tick in axis.get_xticklabels()] == ["Clear\nNoon", "Clear\nNight"]
+
+
+def test_weights_over_an_episode(tmp_path: Path) -> None:
+    rows = weight_rows({0: [0.2, 0.4], 1: [0.5]}) + weight_rows({0: [0.9]}, weather=NOON)
+    ends = {"return": 8.0, "distance": 70.0, "steps": 2, "crashed": True, "offroad": False}
+    episodes = [{"method": "have", "seed": 0, "weather": NIGHT, "episode_seed": 7, **ends}]
+    results = read(tmp_path, final=final(), weights=rows, episodes=episodes)
+    noon, night = figures.plot_episode_weights(results, "have", 0).axes
+    assert (noon.get_title(), night.get_title()) == (NOON, f"{NIGHT}, return 8")
+    assert points(line(night, "rgb")) == [(0, 0.2), (1, 0.4)]
+    assert points(line(night, "event")) == [(0, 0.8), (1, 0.6)] and points(line(noon, "rgb")) == [(0, 0.9)]
+    with pytest.raises(ValueError, match="'lve' with seed 3"):
+        figures.plot_episode_weights(results, "lve", 3)
+
+
+def test_kept_share_bars(tmp_path: Path) -> None:
+    rows = failure_rows({"have": {0: (100.0, 60.0), 1: (200.0, 110.0)}, "sac": {0: (60.0, 150.0)}})
+    rows += [row for row in failure_rows({"sac": {0: (60.0, 45.0)}}, "event") if row["kind"] == "black"]
+    table = tables.kept_table(read(tmp_path, final=final(), failures=rows))
+    figure = figures.plot_kept(table, RETURN)
+    rgb, event = panel(figure, "rgb fails"), panel(figure, "event fails")
+    assert bars(rgb) == {"#888888": [pytest.approx(10)], "#000000": [pytest.approx(0.3)]}
+    assert bars(event) == {"#888888": [pytest.approx(-0.5)]}
+    np.testing.assert_allclose(whiskers(rgb), [[0.2, 0.4]])
+    assert rgb.get_ylim()[1] == figures.KEPT[1] and -1 <= rgb.get_ylim()[0] < -0.5
+    assert [tick.get_text() for tick in rgb.get_xticklabels()] == ["black"]
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["sac", "have"]
+
+
+def test_methods_look_different_and_always_the_same() -> None:
+    looks = [(style.colour, style.line, style.marker, style.hatch) for style in figures.STYLES.values()]
+    assert len(set(looks)) == len(looks)
+    for other, style in figures.STYLES.items():
+        alike = [name for name, look in figures.STYLES.items() if look[:2] == style[:2] and name != other]
+        assert not alike, f"{other} is told from {alike} by its marker only"
+    assert figures.style("my-method") == figures.style("my-method") != figures.style("have")
+
+
+def test_letters_are_legible(results: Results) -> None:
+    for figure in (figures.plot_learning_curves(results), figures.plot_scores(results), figures.plot_profiles(results)):
+        figure.draw_without_rendering()
+        sizes = [
+            float(text.get_fontsize()) for text in figure.findobj(Text) if isinstance(text, Text) and text.get_text()
+        ]
+        assert len(sizes) > 5 and min(sizes) >= 9

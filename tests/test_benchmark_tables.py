@@ -1,0 +1,186 @@
+"""Tables of a benchmark: worked out by hand."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from benchmark_results import (
+    DISTANCES,
+    NIGHT,
+    NOON,
+    STD,
+    evaluations,
+    failure_rows,
+    final,
+    moments,
+    read,
+    run_rows,
+    write,
+)
+from matplotlib.figure import Figure
+
+from sb3_have.benchmark import tables
+from sb3_have.benchmark.reading import DISTANCE, RETURN, Results
+from sb3_have.benchmark.report import write_report
+
+
+@pytest.fixture
+def results(tmp_path: Path) -> Results:
+    return read(tmp_path / "core", final=final(), evaluations=evaluations(), runs=run_rows())
+
+
+@pytest.fixture
+def words_only(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures are not drawn, which takes most of a report's time."""
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **kwargs: Path(path).touch())
+
+
+def cell(table: pd.DataFrame, weather: str, driver: str, measure: str = "distance") -> dict[str, Any]:
+    chosen = (table["weather"] == weather) & (table["driver"] == driver) & (table["measure"] == measure)
+    (row,) = table[chosen].to_dict("records")
+    return {str(key): value for key, value in row.items()}
+
+
+# Table 1
+
+
+def test_weather_table_by_hand(results: Results) -> None:
+    table = tables.weather_table(results)
+    assert list(dict.fromkeys(table["weather"])) == [NOON, NIGHT, "all"]
+    noon, everywhere = cell(table, NOON, "have"), cell(table, "all", "have")
+    assert noon["mean"] == 225 and noon["std"] == pytest.approx(150 / 2**0.5) and noon["spread"] == "seeds"
+    assert noon["seeds"] == 2 and noon["episodes"] == 4 and everywhere["episodes"] == 8
+    # the seeds' means over the weathers are 170 and 275, and 150 and 150
+    assert everywhere["mean"] == 222.5 and everywhere["std"] == pytest.approx(105 / 2**0.5)
+    assert cell(table, "all", "sac")["mean"] == 150 and cell(table, "all", "sac")["std"] == 0
+    assert cell(table, "all", "have", "return")["mean"] == pytest.approx(22.25 - 5)
+    assert table.loc[table["best"], "driver"].unique().tolist() == ["have"]
+
+
+def test_single_seed_spreads_over_episodes(tmp_path: Path) -> None:
+    table = tables.weather_table(read(tmp_path, final=final({"sac": {0: (100, 200)}})))
+    noon, everywhere = cell(table, NOON, "sac"), cell(table, "all", "sac")
+    assert (noon["mean"], noon["std"], noon["spread"], noon["seeds"]) == (100, STD, "episodes", 1)
+    # of four episodes, two about 100 and two about 200
+    assert everywhere["mean"] == 150 and everywhere["std"] == pytest.approx((STD**2 + 50**2) ** 0.5)
+
+
+def test_best_is_bold_and_drivers_are_not(tmp_path: Path) -> None:
+    drivers = [{"driver": "IDM", "weather": weather, **moments(2134)} for weather in (NOON, NIGHT)]
+    runs = {"have": {0: (150, 100)}, "sac": {0: (100, 200)}}
+    results = read(tmp_path, final=final(runs), drivers=drivers)
+    lines = tables.weather_markdown(results, tables.weather_table(results)).splitlines()
+    assert [part.strip() for part in lines[0].split("|")[1:-1]] == ["weather", "", "sac (1)", "have (1)", "IDM"]
+    assert [part.strip() for part in lines[3].split("|")[1:-1]] == [
+        NOON,
+        "D [m]",
+        "100 ± 30",
+        "**150** ± 30",
+        "2134 ± 30",
+    ]
+    assert [part.strip() for part in lines[2].split("|")[1:-1]][2:] == ["5.0 ± 3.0", "**10.0** ± 3.0", "208.4 ± 3.0"]
+    assert "**200** ± 30" in lines[5] and "**150**" in lines[7] and len(lines) == 2 + 3 * 2
+
+
+def test_driver_without_all_weathers_has_no_total(tmp_path: Path) -> None:
+    results = read(tmp_path, final=final(), drivers=[{"driver": "IDM", "weather": NOON, **moments(2134)}])
+    table = tables.weather_table(results)
+    assert table.loc[table["driver"] == "IDM", "weather"].unique().tolist() == [NOON]
+    last = tables.weather_markdown(results, table).splitlines()[-1]
+    assert last.split("|")[-2].strip() == "–"
+
+
+@pytest.mark.usefixtures("words_only")
+def test_drivers_are_told_beside_the_methods(tmp_path: Path) -> None:
+    drivers = [{"driver": "IDM", "weather": weather, **moments(2134)} for weather in (NOON, NIGHT)]
+    report = write_report(write(tmp_path / "a", final=final(), drivers=drivers)).read_text()
+    assert "- Drivers that did not learn: `IDM` 2134 m.\n" in report
+
+
+def test_newest_complete_step_counts(tmp_path: Path) -> None:
+    longer = final({"sac": {0: (400, 500)}}, step=4000)
+    unfinished = final({"sac": {0: (900,)}}, step=6000)
+    results = read(tmp_path, final=[*final(), *longer, *unfinished])
+    np.testing.assert_array_equal(results.scores("sac", DISTANCE), [[400, 500], [140, 160]])
+    (sac,) = (row for row in tables.run_table(results).to_dict("records") if row["method"] == "sac")
+    assert sac["steps"] == "2000 / 4000"
+
+
+@pytest.mark.usefixtures("words_only")
+def test_environment_without_distance(tmp_path: Path) -> None:
+    untold = {"distance_mean": None, "distance_std": None}
+    results = read(tmp_path, final=[row | untold for row in final()], evaluations=[r | untold for r in evaluations()])
+    assert results.measures == [RETURN]
+    report = write_report(tmp_path, tmp_path / "out").read_text()
+    assert "D [m]" not in report and "IQM of return" in report and not re.search(r"\bnan\b", report)
+
+
+# Table 2 and statistics
+
+
+def test_ablation_leaves_out_what_is_no_part_of_it(tmp_path: Path) -> None:
+    runs = {"sac": {0: (1, 2)}, "lve": {0: (100, 200)}, "have": {0: (200, 300)}}
+    results = read(tmp_path, final=final(runs), runs=run_rows(runs))
+    table = tables.ablation_table(results)
+    assert table["method"].tolist() == ["lve", "have"] and table["parameters"].tolist() == ["1234", "1234"]
+    assert table["distance_mean"].tolist() == [150, 250]
+    last = tables.ablation_markdown(results, table).splitlines()[-1]
+    assert "**250** ± 58" in last and "**20.0** ± 5.8" in last
+
+
+def test_statistics_by_hand(results: Results) -> None:
+    rows = tables.score_table(results).to_dict("records")
+    sac, have = (row for row in rows if row["measure"] == "distance")
+    # of 150, 190, 250, 300 and 100, 140, 160, 200 the middle ones
+    assert have["iqm"] == 220 and sac["iqm"] == 150
+    # at noon 4 of 4 pairs, at night 3 of 4
+    assert sac["improvement"] == 7 / 8 and np.isnan(have["improvement"])
+    assert 0.5 <= sac["improvement_lower"] < 7 / 8 < sac["improvement_upper"] == 1
+    assert 100 <= sac["iqm_lower"] < 150 < sac["iqm_upper"] <= 200
+
+
+@pytest.mark.usefixtures("words_only")
+def test_no_interval_from_a_single_seed(tmp_path: Path) -> None:
+    runs = {**DISTANCES, "lve": {0: (160, 180)}}
+    results = read(tmp_path, final=final(runs))
+    table = tables.score_table(results)
+    lve = table[(table["method"] == "lve") & (table["measure"] == "distance")].iloc[0]
+    assert lve["iqm"] == 170 and lve["improvement"] == 0.75
+    assert lve[["iqm_lower", "iqm_upper", "improvement_lower", "improvement_upper"]].isna().all()
+    assert np.isfinite(table.loc[table["method"] != "lve", "iqm_lower"]).all()
+    text = tables.score_markdown(table, DISTANCE, "have").splitlines()
+    assert [part.strip() for part in text[3].split("|")[1:-1]] == ["lve", "1", "170", "0.75"]
+    report = write_report(tmp_path, tmp_path / "out").read_text()
+    assert "lve: a single seed, hence no interval" in report and "not known for want of seeds for `lve`" in report
+
+
+@pytest.mark.usefixtures("words_only")
+def test_kept_share_by_hand(tmp_path: Path) -> None:
+    # returns 5 -> 1 and 15 -> 6; the healthy return of lve's seed 1 is negative
+    kept = {"have": {0: (100.0, 60.0), 1: (200.0, 110.0)}, "lve": {0: (100.0, 60.0), 1: (40.0, 20.0)}}
+    results = read(tmp_path, final=final(), failures=failure_rows(kept))
+    lve, have = tables.kept_table(results).to_dict("records")
+    assert (lve["method"], have["method"], have["modality"], have["kind"]) == ("lve", "have", "rgb", "black")
+    assert have["return_kept"] == pytest.approx((0.2 + 0.4) / 2)
+    assert (have["return_lowest"], have["return_highest"]) == pytest.approx((0.2, 0.4))
+    assert have["distance_kept"] == pytest.approx((0.6 + 0.55) / 2)
+    assert (lve["return_kept"], lve["return_seeds"]) == (pytest.approx(0.2), 1)
+    assert (lve["distance_kept"], lve["distance_seeds"]) == (pytest.approx((0.6 + 0.5) / 2), 2)
+    report = write_report(tmp_path, tmp_path / "out").read_text()
+    assert "there is none with the failure: lve (rgb black)." in report
+
+
+def test_kept_share_is_of_the_same_weathers(tmp_path: Path) -> None:
+    rows = failure_rows({"have": {0: (100.0, 60.0)}})
+    rows.append({**rows[0], "weather": NOON, **moments(1000, 1)})  # healthy only
+    (have,) = tables.kept_table(read(tmp_path, final=final(), failures=rows)).to_dict("records")
+    assert have["distance_kept"] == pytest.approx(0.6)
+
+
+def test_markdown_escapes_and_lines_up() -> None:
+    assert tables.markdown(["a|b", "c"], [["1", "long"]]) == "| a\\|b | c    |\n|------|------|\n| 1    | long |"
