@@ -29,8 +29,9 @@ from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
 from stable_baselines3.sac.policies import Actor
 
-from benchmarks.measure import RESULTS, machine
+from benchmarks.measure import RESULTS
 from sb3_have import HAVESAC, MultiModalPolicy
+from sb3_have.common.machine import machine
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Observation: TypeAlias = dict[str, NDArray[np.float32]]
