@@ -7,7 +7,18 @@ import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
-from envs import IMAGE_SIZE, RandomSensors, batched, changed, clone_parameters, image, sensors_space, tiny_model, vector
+from envs import (
+    IMAGE_SIZE,
+    RandomSensors,
+    batched,
+    changed,
+    clone_parameters,
+    image,
+    quiet_logger,
+    sensors_space,
+    tiny_model,
+    vector,
+)
 from gymnasium import spaces
 from sb3_contrib import TQC
 from stable_baselines3 import SAC
@@ -257,7 +268,7 @@ def off_the_shelf(algorithm: Any, space: spaces.Space[Any], **policy_kwargs: Any
         **policy_kwargs,
     }
     return algorithm(
-        "MultiInputPolicy",
+        "MultiInputPolicy" if isinstance(space, spaces.Dict) else "MlpPolicy",
         RandomSensors(space),
         learning_starts=8,
         batch_size=8,
@@ -297,6 +308,27 @@ def test_extractor_is_trained_and_comes_back(algorithm: Any, tmp_path: Path) -> 
     observation = batched(RandomSensors(sensors_space()).observation_space.sample())
     first, second = (one.predict(observation, deterministic=True)[0] for one in (model, loaded))
     assert np.array_equal(first, second)
+
+
+def test_crossq_learns_from_a_dict_as_from_a_box() -> None:
+    """To the same bits, where the only key holds what the Box holds."""
+    models = [off_the_shelf(MultiInputCrossQ, space) for space in (vector(4), spaces.Dict({"a": vector(4)}))]
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        observation, next_observation = rng.uniform(-1, 1, (2, 1, 4)).astype(np.float32)
+        action, reward = rng.uniform(-1, 1, (1, 2)).astype(np.float32), rng.normal(size=1)
+        pairs = [(observation, next_observation), ({"a": observation}, {"a": next_observation})]
+        for model, pair in zip(models, pairs, strict=True):
+            model.replay_buffer.add(*pair, action, reward, np.array([False]), [{}])
+    before = clone_parameters(models[0].policy)
+    for model in models:
+        model.set_logger(quiet_logger())
+        np.random.seed(0)
+        th.manual_seed(0)
+        model.train(3, batch_size=8)
+    box, mapping = models
+    assert changed(before, box.policy) == set(before)
+    assert not changed(clone_parameters(box.policy), mapping.policy)
 
 
 @pytest.mark.parametrize("space", [sensors_space(), image(3)])
