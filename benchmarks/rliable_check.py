@@ -2,7 +2,7 @@
 
 rliable (https://github.com/google-research/rliable) is the reference implementation of Agarwal et al. 2021. It depends
 on much that nothing else here needs, so its figures are committed, and `tests/test_statistics.py` compares with them.
-To make them anew (half a minute), in an environment of its own that needs no ``sb3_have``::
+To make them anew (minutes), in an environment of its own that needs no ``sb3_have``::
 
     python -m venv rliable-venv
     rliable-venv/bin/pip install "rliable==1.2.0" "pandas<3"

@@ -31,8 +31,6 @@ SINGLE = [iqm, mean, median, optimality_gap]
 
 # Whole numbers tie often, and sums of them are exact.
 SCORES = st.integers(-20, 20).map(float)
-
-
 untimed = settings(deadline=None)
 
 
@@ -231,6 +229,12 @@ def test_coverage(statistic: Callable[..., Any], better: bool) -> None:
 
     truth = (1 + math.erf(0.25)) / 2 if better else 0.0  # x - y has mean 0.5 and variance 2
     assert 0.89 <= held(statistic, truth, draw) <= 0.975
+
+
+@pytest.mark.parametrize("runs, share", [(3, 0.75), (8, 0.9)])
+def test_few_runs_cover_as_documented(runs: int, share: float) -> None:
+    rng = np.random.default_rng(0)
+    assert held(mean, 0.0, lambda: [rng.normal(size=(runs, 1))]) == pytest.approx(share, abs=0.06)
 
 
 def test_runs_scored_on_every_task_are_kept_whole() -> None:
