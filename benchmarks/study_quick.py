@@ -20,21 +20,21 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import nullcontext
 from multiprocessing import get_context
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pandas as pd
 import torch as th
 
 from benchmarks import known_q, reliability
-from benchmarks.measure import RESULTS
+from benchmarks.measure import RESULTS, save
 from benchmarks.planted_faults import FAULTS
 from sb3_have.common.machine import machine
 
-SEEDS = (0, 1, 2)
-SOUND_SEEDS = (SEEDS, (3, 4, 5), (6, 7, 8))
-N_DRIVES = 2
-"""Of the seeds, how many also learn to drive."""
+SEEDS = (0, 1)
+SOUND_SEEDS = (SEEDS, (2, 3), (4, 5))
 DRIVE_UPDATES = 2000
+RECORD = RESULTS / "study_quick"
+SOUND = "sound"
 N_PROCESSES = 2
 
 
@@ -68,6 +68,9 @@ DRIVING = (
 )
 
 
+SUITES = {"known Q": KNOWN_Q, "driving": DRIVING}
+
+
 class Verdict(NamedTuple):
     """A measure against its bounds."""
 
@@ -78,13 +81,13 @@ class Verdict(NamedTuple):
     ok: bool
 
 
-def judge(suite: str, bounds: Sequence[Bound], measured: Sequence[Mapping[str, float]]) -> list[Verdict]:
+def judge(suite: str, measured: Sequence[Mapping[str, float]]) -> list[Verdict]:
     """
-    :param suite: its name
-    :param bounds: what the measures have to be
+    :param suite: one of ``SUITES``
     :param measured: measures by name, of each seed
     :return: one verdict for each bound; a NaN is out of any bounds
     """
+    bounds = SUITES[suite]
     worst = [max((row[bound.measure] for row in measured), key=bound.excess) for bound in bounds]
     return [Verdict(suite, bound, value, bound.excess(value) <= 0) for bound, value in zip(bounds, worst, strict=True)]
 
@@ -128,60 +131,85 @@ def study(seeds: Sequence[int] = SEEDS, fault: str | None = None) -> list[Verdic
     """
     with ProcessPoolExecutor(N_PROCESSES, mp_context=get_context("spawn")) as pool:
         measured = list(pool.map(learn_known_q, seeds, [fault] * len(seeds)))
-        verdicts = judge("known Q", KNOWN_Q, measured)
+        verdicts = judge("known Q", measured)
         if all(verdict.ok for verdict in verdicts):  # else the longer runs would add nothing
-            driven = list(pool.map(learn_to_drive, seeds[:N_DRIVES], [fault] * N_DRIVES))
-            verdicts += judge("driving", DRIVING, driven)
+            driven = list(pool.map(learn_to_drive, seeds, [fault] * len(seeds)))
+            verdicts += judge("driving", driven)
     return verdicts
 
 
-def record() -> bool:
+def record(names: Sequence[str]) -> bool:
     """
-    Sound code and every fault, written to ``faults.csv`` and ``faults.md``.
+    Runs studies, and puts what they print in ``faults.csv`` and ``faults.md``, in place of what was there of them.
 
+    :param names: "sound", for the sound code with several sets of seeds, and faults
     :return: whether all sound studies passed and all faults were found
     """
-    folder = RESULTS / "study_quick"
-    folder.mkdir(parents=True, exist_ok=True)
-    cases: list[tuple[str | None, Sequence[int]]] = [(fault, SEEDS) for fault in FAULTS]
-    cases += [(None, seeds) for seeds in SOUND_SEEDS]
-    rows, as_expected = [], True
-    text = "# What the quick study prints\n\n"
-    text += "`python -m benchmarks.study_quick --record`: one planted fault at a time, then the sound code.\n"
-    for fault, seeds in cases:
-        start = time.perf_counter()
-        verdicts = study(seeds, fault)
-        passed = all(verdict.ok for verdict in verdicts)
-        as_expected &= passed == (fault is None)
-        case = {
-            "fault": fault or "none",
-            "seeds": " ".join(map(str, seeds)),
-            "exit_code": int(not passed),
-            "seconds": round(time.perf_counter() - start),
-        }
-        rows += [
-            {**case, "suite": suite, "measure": bound.measure, "worst": round(worst, 5)}
-            | {"lower": bound.lower, "upper": bound.upper, "ok": ok, **machine()}
-            for suite, bound, worst, ok in verdicts
-        ]
-        said = FAULTS[fault].__doc__ if fault else "The sound code."
-        section = f"\n## {', '.join(f'{name} {value}' for name, value in case.items())}\n\n{said}\n\n"
-        section += f"```\n{describe(verdicts)}\n```\n"
-        print(section, flush=True)
-        text += section
-        pd.DataFrame(rows).to_csv(folder / "faults.csv", index=False)
-        (folder / "faults.md").write_text(text)
+    as_expected = True
+    for name in names:
+        fault = None if name == SOUND else name
+        for seeds in SOUND_SEEDS if fault is None else [SEEDS]:
+            start = time.perf_counter()
+            verdicts = study(seeds, fault)
+            passed = all(verdict.ok for verdict in verdicts)
+            as_expected &= passed == (fault is None)
+            case = {
+                "study": name,
+                "seeds": " ".join(map(str, seeds)),
+                "exit_code": int(not passed),
+                "seconds": round(time.perf_counter() - start),
+            }
+            rows = [
+                {**case, "suite": suite, "measure": bound.measure, "worst": round(worst, 5)}
+                | {"lower": bound.lower, "upper": bound.upper, "ok": ok, **machine()}
+                for suite, bound, worst, ok in verdicts
+            ]
+            save(rows, RECORD / "faults.csv", group=["study", "seeds"])
+            print(case, describe(verdicts), sep="\n", flush=True)
+    (RECORD / "faults.md").write_text(summary(pd.read_csv(RECORD / "faults.csv")))
     return as_expected
+
+
+def summary(table: pd.DataFrame) -> str:
+    """
+    :param table: the rows of ``faults.csv``
+    :return: Markdown, with what each study printed
+    """
+    bounds = {(suite, bound.measure): bound for suite, bounds in SUITES.items() for bound in bounds}
+    studies: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in table.to_dict("records"):
+        studies.setdefault((row["study"], row["seeds"]), []).append({str(name): value for name, value in row.items()})
+    text = "# What the quick study prints\n\nBy `python -m benchmarks.study_quick --record`: "
+    text += "the sound code, then one planted fault at a time.\n"
+    order = [SOUND, *FAULTS]
+    for name, seeds in sorted(studies, key=lambda study: (order.index(study[0]), study[1])):
+        rows = studies[name, seeds]
+        verdicts = [
+            Verdict(row["suite"], bounds[row["suite"], row["measure"]], row["worst"], row["ok"]) for row in rows
+        ]
+        text += f"\n## {name}, seeds {seeds}: exit code {rows[0]['exit_code']}\n\n"
+        text += f"{FAULTS[name].__doc__}\n\n" if name in FAULTS else ""
+        text += f"```\n{describe(verdicts)}\n```\n"
+    return text
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--fault", choices=list(FAULTS), help="plant this fault")
     parser.add_argument("--seeds", type=int, nargs="+", default=list(SEEDS))
-    parser.add_argument("--record", action="store_true", help="run the sound code and every fault, and write it down")
+    parser.add_argument(
+        "--record",
+        nargs="*",
+        choices=[SOUND, *FAULTS],
+        help="write these studies down; by default the sound code and all",
+    )
     args = parser.parse_args()
-    if args.record:
-        sys.exit(None if record() else "A sound study failed, or a fault was not found: see above.")
+    if args.record is not None:
+        sys.exit(
+            None
+            if record(args.record or [SOUND, *FAULTS])
+            else "A sound study failed, or a fault was not found: see above."
+        )
     start = time.perf_counter()
     verdicts = study(args.seeds, args.fault)
     print(describe(verdicts))
