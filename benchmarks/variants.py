@@ -67,8 +67,9 @@ class TemperedAssignment(AssignmentNetwork):
 
 def policy_with(assignment_class: type[AssignmentNetwork], name: str) -> type[MultiModalPolicy]:
     """A policy named ``name`` whose attention is of this class."""
-    critic_class = type(f"{name}Critic", (MultiModalCritic,), {"assignment_class": assignment_class})
-    return type(name, (MultiModalPolicy,), {"critic_class": critic_class})
+    here = {"__module__": __name__}
+    critic_class = type(f"{name}Critic", (MultiModalCritic,), {"assignment_class": assignment_class, **here})
+    return type(name, (MultiModalPolicy,), {"critic_class": critic_class, **here})
 
 
 def temperature(x: float) -> type[MultiModalPolicy]:
