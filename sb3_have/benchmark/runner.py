@@ -86,7 +86,7 @@ class Runner:
             with self._signals():
                 self._work(pool, bar)
             bar.n = self._steps()
-        return self._conclude()
+        return self.conclude()
 
     def _work(self, pool: Pool, bar: tqdm[Any]) -> None:
         stopped_at = None
@@ -148,7 +148,8 @@ class Runner:
             done += whole if job.name in self.finished else min(steps_done(self.runs / job.name), whole)
         return done
 
-    def _conclude(self) -> int:
+    def conclude(self) -> int:
+        """Say what is finished and what failed; the exit code."""
         print(f"{len(self.finished)} of {len(self.jobs)} runs finished, results in {self.results}")
         for name in self.failed:
             print(f"failed: {name}, {self.runs / name / 'traceback.txt'}")
@@ -222,7 +223,7 @@ def main(arguments: list[str] | None = None) -> int:
             runner = Runner(jobs, runs, results, args.retries, args.time_limit)
             print(describe(grid, jobs, runner), flush=True)
             if runner.is_done:
-                return runner._conclude()
+                return runner.conclude()
             if args.address is not None:
                 print(f"the machines of {args.address} must share {runs}")
             pool = RayPool(runs, args.address, args.workers, args.gpus, args.keep_checkpoints)
