@@ -330,8 +330,8 @@ def main() -> None:
         rows = []
         for seed in range(args.seeds):
             measures = run(seed, args.updates, **FORMS[form])
-            rows.append({"form": form, "seed": seed, "updates": args.updates, **vars(measures)})
-        pd.DataFrame([{**row, **machine()} for row in rows]).round(5).to_csv(folder / f"{form}.csv", index=False)
+            rows.append({"form": form, "seed": seed, "updates": args.updates, **vars(measures), **machine()})
+            pd.DataFrame(rows).round(5).to_csv(folder / f"{form}.csv", index=False)
         print(table(rows).T.to_string(), flush=True)
         everything += rows
     print(table(everything).T.to_string())

@@ -86,6 +86,7 @@ def test_q_of_a_task_without_dynamics() -> None:
 
 def test_sensors_fail_in_turn() -> None:
     env = SensorRing()
+    assert all(len(np.unique(codes, axis=0)) == env.n_states for codes in env.codes)
     observation, info = env.reset(seed=0)
     seen = []
     for _ in range(300):

@@ -209,7 +209,7 @@ class SameProcess:
 def fake_runs(monkeypatch: pytest.MonkeyPatch, bad_when: Callable[[], bool]) -> list[tuple[str, int]]:
     """Trainings that measure good values, and a bad weight AUC if ``bad_when``; returns the list of them."""
     runs: list[tuple[str, int]] = []
-    good_drive = {bound.measure: (bound.lower + bound.upper) / 2 for bound in DRIVING}
+    good_drive = {bound.measure: bound.lower for bound in DRIVING}
 
     def run(seed: int) -> SimpleNamespace:
         runs.append(("known Q", seed))
@@ -264,12 +264,13 @@ def test_driving_out_of_bounds_fails(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_record(found: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Every case is written down; a fault that is not found, or a sound study that fails, is an error."""
 
-    def study(seeds: tuple[int, ...], fault: str | None) -> list[Verdict]:
+    def study(pool: object, seeds: tuple[int, ...], fault: str | None) -> list[Verdict]:
         bad = fault is not None and (found or fault != "frozen_refusion")
         return judge("known Q", [{**GOOD, "error": 9.0} if bad else GOOD])
 
     monkeypatch.setattr(study_quick, "RECORD", tmp_path)
     monkeypatch.setattr(study_quick, "study", study)
+    monkeypatch.setattr(study_quick, "ProcessPoolExecutor", SameProcess)
     assert (run_main(monkeypatch, "--record") is None) == found
     assert (run_main(monkeypatch, "--record", "frozen_refusion") is None) == found  # in place of the same row
     table = pd.read_csv(tmp_path / "faults.csv")
