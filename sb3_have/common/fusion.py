@@ -6,6 +6,7 @@ stage (a convolution and its ReLU) of all encoders; each encoder then goes on wi
 still d features, and everything that is done with features of modalities can be done with these.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -127,10 +128,11 @@ class SelfAttention(nn.Module):
         self.projection = nn.Linear(width, width)
 
     def forward(self, x: th.Tensor) -> th.Tensor:
-        query, key, value = (
-            self.qkv(x).unflatten(2, (3, self.n_heads, -1)).permute(2, 0, 3, 1, 4)
-        )  # (B, heads, T, size)
-        attended = F.scaled_dot_product_attention(query, key, value)  # its softmax is in float32
+        query, key, value = self.qkv(x).unflatten(2, (3, self.n_heads, -1)).permute(2, 0, 3, 1, 4)
+        # (B, heads, T, size) each; PyTorch's fused attention has a slow backward pass in bfloat16 on the CPU
+        scores = query @ key.transpose(2, 3) / math.sqrt(query.shape[3])
+        weights = F.softmax(scores, dim=3, dtype=th.promote_types(scores.dtype, th.float32))
+        attended = weights.to(value.dtype) @ value
         out: th.Tensor = self.projection(attended.transpose(1, 2).flatten(2))
         return out
 
