@@ -110,9 +110,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         save(rows, args.out)
         told = {measure: value for _, _, _, measure, value in rows}
         print(f"{i}/{len(todo)} {rows[0][0]}-{rows[0][1]}: {_summary(told)}", flush=True)
-    rows = load(args.out)
-    chosen = (rows["updates"] == args.updates) & rows["method"].isin(args.methods) & (rows["seed"] < args.seeds)
-    text = report(rows[chosen])
+    table = load(args.out)
+    chosen = table["updates"].eq(args.updates) & table["method"].isin(args.methods) & table["seed"].lt(args.seeds)
+    text = report(table[chosen])
     (args.out / "report.md").write_text(text)
     print(text)
 

@@ -220,7 +220,7 @@ def value_errors(model: HAVESAC, n_episodes: int = N_EPISODES, n_steps: int = 20
     env = ReliabilityDriveVecEnv(n_episodes, n_modalities=N_MODALITIES, max_episode_steps=2 * n_steps + 1)
     env.seed(EVALUATION_SEED)
     observation = env.reset()
-    alpha = float(th.exp(model.log_ent_coef.detach())) if model.log_ent_coef is not None else 0.0
+    alpha = float(model.ent_coef_tensor if model.log_ent_coef is None else model.log_ent_coef.detach().exp())
     alive = np.ones(n_episodes, bool)
     rows = []
     generator_state = th.get_rng_state()
@@ -234,10 +234,12 @@ def value_errors(model: HAVESAC, n_episodes: int = N_EPISODES, n_steps: int = 20
         observation, rewards, dones, _ = env.step(actions.numpy())
         rows.append((q, -alpha * log_prob.numpy(), rewards, alive.copy(), dones))
         alive &= ~dones
+        if not alive.any():
+            break
     th.set_rng_state(generator_state)
     q, bonus, rewards, lived, dones = (np.stack(column) for column in zip(*rows, strict=True))
     returns = np.empty_like(q)
-    returns[-1] = q[-1]
+    returns[-1] = np.where(dones[-1], rewards[-1], q[-1])
     for t in range(len(q) - 2, -1, -1):
         returns[t] = rewards[t] + model.gamma * ~dones[t] * (bonus[t + 1] + returns[t + 1])
     q, returns = q[:n_steps][lived[:n_steps]], returns[:n_steps][lived[:n_steps]]

@@ -44,11 +44,11 @@ class ReliabilityDriveVecEnv(VecEnv):
         infos = [self.batch.info(i) for i in range(self.num_envs)]
         for i, info in enumerate(infos):
             info["TimeLimit.truncated"] = bool(truncated[i])
-        ended = np.flatnonzero(dones)
-        if len(ended):
+        ended = np.flatnonzero(dones).tolist()
+        if ended:
             for i in ended:
                 infos[i]["terminal_observation"] = {key: value[i].copy() for key, value in observation.items()}
-            self.batch.reset(ended)
+            self.batch.reset(np.array(ended))
             observation = self.batch.observation()
             for i in ended:
                 self.reset_infos[i] = self.batch.info(i)
