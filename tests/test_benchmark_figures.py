@@ -26,7 +26,7 @@ from matplotlib.lines import Line2D
 from matplotlib.text import Text
 
 from sb3_have.benchmark import figures, tables
-from sb3_have.benchmark.reading import RETURN, Results
+from sb3_have.benchmark.reading import DISTANCE, RETURN, Results
 
 
 @pytest.fixture
@@ -166,6 +166,18 @@ def test_kept_share_bars(tmp_path: Path) -> None:
     assert [tick.get_text() for tick in rgb.get_xticklabels()] == ["black"]
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["sac", "have"]
+
+
+def test_kept_share_bars_stand_over_their_kind(tmp_path: Path) -> None:
+    black = failure_rows({"have": {0: (100.0, 60.0)}, "drq": {0: (100.0, 70.0)}})
+    noise = [row | moments(row["distance_mean"] - 30, 1) | {"kind": "noise"} for row in black if row["kind"] == "black"]
+    table = tables.kept_table(read(tmp_path, final=final(), failures=[*black, *noise]))
+    (axis,) = figures.plot_kept(table, DISTANCE).axes
+    assert [tick.get_text() for tick in axis.get_xticklabels()] == ["black", "noise"]
+    drq, have = (group.patches for group in axis.containers if isinstance(group, BarContainer))
+    drawn = [(bar.get_x() + bar.get_width() / 2, bar.get_y(), bar.get_height()) for bar in [*drq, *have]]
+    np.testing.assert_allclose(drawn, [(-0.21, 0, 0.7), (0.79, 0, 0.4), (0.21, 0, 0.6), (1.21, 0, 0.3)])
+    assert drq[0].get_hatch() and not have[0].get_hatch()
 
 
 def test_methods_look_different_and_always_the_same() -> None:

@@ -71,6 +71,16 @@ def test_grid_tells_what_there_is_to_be(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("words_only")
+def test_each_grid_has_seeds_of_its_own(tmp_path: Path) -> None:
+    folders = [write(tmp_path / name, final=final({name: DISTANCES["have"]})) for name in ("have", "sac")]
+    grids = [tmp_path / f"{name}.yml" for name in ("have", "sac")]
+    grids[0].write_text("methods: [have]\nseeds: [0, 1]\n")
+    grids[1].write_text("methods: [sac]\nseeds: [0, 1, 2]\n")
+    report = write_report(folders, tmp_path / "out", grids=grids).read_text()
+    assert "- `sac`: seed not begun: 2\n" in report and "- `have`: seed" not in report
+
+
+@pytest.mark.usefixtures("words_only")
 def test_report_before_any_run_is_finished(tmp_path: Path) -> None:
     write(tmp_path, evaluations=evaluations(shares={1000: 0.5}))
     (tmp_path / "final.csv").write_text(",".join(final()[0]) + "\n")
