@@ -89,7 +89,7 @@ def test_sensors_fail_in_turn() -> None:
     assert all(len(np.unique(codes, axis=0)) == env.n_states for codes in env.codes)
     observation, info = env.reset(seed=0)
     seen = []
-    for _ in range(300):
+    for _ in range(6000):
         shown = np.stack([observation[key] for key in env.keys])
         errors = np.abs(shown - env.codes[:, info["state"]]).max(axis=1)
         assert ((errors < 0.6) == info["reliable"]).all()
