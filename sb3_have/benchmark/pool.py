@@ -49,8 +49,9 @@ class RayPool:
         quiet: dict[str, Any] = {"logging_level": logging.ERROR, "log_to_driver": False}
         if address is None:
             quiet |= {"num_cpus": workers, "include_dashboard": False, "object_store_memory": OBJECT_STORE}
-        # A SIGTERM to the whole process group (timeout sends one) must find Ray alive: the runs are to save first. The
-        # mask is inherited by Ray's processes; Ctrl-C is masked there by Ray itself.
+        # A SIGTERM to the whole process group, as timeout sends it, must not end Ray: without its head everything would
+        # die after a minute, and the runs may still be saving. Ray's processes inherit the mask; Ctrl-C they mask
+        # themselves.
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})
         try:
             ray.init(address=address, **quiet)
