@@ -162,7 +162,7 @@ def interval(statistic: Callable[..., Any], *scores: ArrayLike) -> Interval:
     """A statistic with its bootstrap interval, which is NaN where a table has a single run: nothing would vary."""
     if min(len(np.asarray(table)) for table in scores) < 2:
         return Interval(float(statistic(*scores)), np.nan, np.nan)
-    return stratified_bootstrap(statistic, *scores)
+    return stratified_bootstrap(statistic, *scores, whole_runs=True)
 
 
 def _named(name: str, values: Interval) -> dict[str, float]:
