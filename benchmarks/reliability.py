@@ -15,6 +15,8 @@ from __future__ import annotations
 import argparse
 import itertools
 import multiprocessing
+import signal
+import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
@@ -64,6 +66,8 @@ def run_all(
                 yield future.result()
         finally:
             pool.shutdown(wait=False, cancel_futures=True)
+            for worker in context.active_children():  # in the middle of a run, if this was stopped
+                worker.terminate()
 
 
 def _run(method: str, seed: int, n_updates: int) -> list[tuple[str, int, int, str, float]]:
@@ -105,6 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--report", action="store_true", help="make no runs")
     args = parser.parse_args(arguments)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("stopped"))  # as by Ctrl-C: the workers are to end too
     todo = [] if args.report else missing(load(args.out), args.methods, args.seeds, args.updates)
     for i, rows in enumerate(run_all(todo, args.updates, args.workers), 1):
         save(rows, args.out)

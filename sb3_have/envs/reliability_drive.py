@@ -183,7 +183,8 @@ class DriveBatch:
     def curvature(self, s: np.ndarray) -> np.ndarray:
         """Of the road [1/m] at s (N,), left is positive."""
         waves = BENDS[:, 0] * np.sin(2 * np.pi * s[:, None] / BENDS[:, 1] + self.phases[:, :-1])
-        return np.sum(waves, axis=1)
+        curvature: np.ndarray = waves.sum(axis=1)
+        return curvature
 
     def speed_to_hold(self, s: np.ndarray) -> np.ndarray:
         """The speed to hold [m/s] at s (N,)."""
