@@ -13,7 +13,7 @@ import torch as th
 from benchmarks import known_q, reliability, study_quick
 from benchmarks.known_q import Measures, make_model
 from benchmarks.planted_faults import FAULTS
-from benchmarks.study_quick import DRIVING, KNOWN_Q, SEEDS, SOUND_SEEDS, Bound, Verdict, describe, judge
+from benchmarks.study_quick import DRIVING, KNOWN_Q, RECORD_SEEDS, SEEDS, Bound, Verdict, describe, judge
 from sb3_have import HAVESAC, MultiModalCritic, MultiModalPolicy
 
 GOOD = {
@@ -242,7 +242,7 @@ def is_broken(method: str) -> bool:
 def test_sound_code_passes(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     runs = fake_runs(monkeypatch, bad_when=lambda: is_broken("_critic_loss"))
     assert run_main(monkeypatch) == 0
-    assert runs == [("known Q", seed) for seed in SEEDS] + [("driving", seed) for seed in SEEDS]
+    assert runs == [("known Q", seed) for seed in SEEDS] + [("driving", seed) for seed in SEEDS[:2]]
     assert "Passed" in capsys.readouterr().out
 
 
@@ -274,7 +274,7 @@ def test_record(found: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) ->
     assert (run_main(monkeypatch, "--record") is None) == found
     assert (run_main(monkeypatch, "--record", "frozen_refusion") is None) == found  # in place of the same row
     table = pd.read_csv(tmp_path / "faults.csv")
-    assert len(table) == (len(FAULTS) + len(SOUND_SEEDS)) * len(KNOWN_Q)
+    assert len(table) == (len(FAULTS) + len(RECORD_SEEDS)) * len(KNOWN_Q)
     codes = table.groupby("study")["exit_code"].max()
     assert codes["sound"] == 0 and codes["swapped_modalities"] == 1 and codes["frozen_refusion"] == found
     text = (tmp_path / "faults.md").read_text()
