@@ -7,10 +7,14 @@ SOURCES = sb3_have tests benchmarks
 # One torch thread a process: the two test processes would otherwise fight over the cores.
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
-.PHONY: demo test lint format type commit-checks install clean
+.PHONY: demo study-quick test lint format type commit-checks install clean
 
 demo: $(INSTALLED)
 	$(BIN)/python -m sb3_have.demo
+
+# Does the algorithm still estimate values as it should? A few minutes; fails if a formula is broken.
+study-quick: $(INSTALLED)
+	OMP_NUM_THREADS=1 $(BIN)/python -m benchmarks.study_quick
 
 test: $(INSTALLED)
 	$(PYTEST) $(ARGS)
