@@ -2,6 +2,7 @@
 
 import itertools
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -114,6 +115,42 @@ def test_critic_is_compared_with_soft_returns() -> None:
     q_values, returns = np.array(pairs).T
     assert bias == pytest.approx((q_values - returns).mean() / returns.std(), rel=1e-3)
     assert correlation == pytest.approx(np.corrcoef(q_values, returns)[0, 1], abs=1e-3)
+
+
+def test_truth_and_weights_are_of_the_same_moment() -> None:
+    """The truth when the action was chosen, beside the weights of that observation."""
+    model = make_model("have", 0)
+    n = 8
+    measured = evaluate(model, n_episodes=n, seed=5)
+    env = ReliabilityDriveVecEnv(n)
+    env.seed(5)
+    observation: Any = env.reset()
+    for step in range(15):
+        assert measured.reliable[step].tolist() == env.batch.reliable.tolist()
+        weights = np.stack(list(model.modality_weights(observation).values()), axis=1)
+        assert measured.weights is not None
+        np.testing.assert_allclose(measured.weights[step], weights, atol=1e-5)
+        actions, _ = model.predict(observation, deterministic=True)
+        observation, *_ = env.step(actions)
+    assert len(np.unique(measured.reliable[:15], axis=0)) > 1  # they changed meanwhile
+
+
+def test_kept_return_is_a_share_of_the_clean_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Mean over the modalities that fail, each for whole episodes and with nothing else failing."""
+    scores = {"black": 40.0, "frozen": 60.0, "noise": 80.0}
+
+    def returns(model: HAVESAC, corruption: float, failure: tuple[int, str] | None = None) -> Any:
+        assert corruption == 0
+        score = 100.0 if failure is None else scores[failure[1]] + failure[0]
+        return SimpleNamespace(returns=np.array([score - 5, score + 5]))
+
+    monkeypatch.setattr(reliability_runs, "evaluate", returns)
+    assert reliability_runs.kept_returns(make_model("gve", 0)) == {
+        "clean_return": 100.0,
+        "kept_black": pytest.approx(0.41),
+        "kept_frozen": pytest.approx(0.61),
+        "kept_noise": pytest.approx(0.81),
+    }
 
 
 @pytest.mark.parametrize("refusion,expected", [("convex", 0.0), ("monotone", 0.0), ("free", 0.5)])
