@@ -120,7 +120,7 @@ def test_critic_is_compared_with_soft_returns() -> None:
 def test_truth_and_weights_are_of_the_same_moment() -> None:
     """The truth when the action was chosen, beside the weights of that observation."""
     model = make_model("have", 0)
-    n = 8
+    n = 24
     measured = evaluate(model, n_episodes=n, seed=5)
     env = ReliabilityDriveVecEnv(n)
     env.seed(5)
