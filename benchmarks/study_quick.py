@@ -65,8 +65,8 @@ KNOWN_Q = (
     Bound("refusion_moved", 1, 1, "the gradient of the re-fusion: its parameters stayed what they were"),
 )
 DRIVING = (
-    Bound("final_return", 60, math.inf, "actor or entropy temperature, if the known Q is within bounds"),
-    Bound("weight_auc", 0.62, 1, "as above, where actions follow from the values"),
+    Bound("final_return", 40, math.inf, "actor or entropy temperature, if the known Q is within bounds"),
+    Bound("weight_auc", 0.8, 1, "as above, where actions follow from the values"),
     Bound("negative_gradient", 0, 0, "as above, at other values"),
 )
 SUITES = {"known Q": KNOWN_Q, "driving": DRIVING}

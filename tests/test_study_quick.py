@@ -255,9 +255,16 @@ def test_a_planted_fault_fails(monkeypatch: pytest.MonkeyPatch, capsys: pytest.C
 
 
 def test_driving_out_of_bounds_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a fault that only driving shows."""
     fake_runs(monkeypatch, bad_when=lambda: False)
-    monkeypatch.setattr(study_quick, "learn_to_drive", lambda seed, fault: {b.measure: math.nan for b in DRIVING})
-    assert run_main(monkeypatch) == 1
+    good = reliability.run_small
+
+    def run_small(seeds: list[int], n_updates: int, n_workers: int) -> pd.DataFrame:
+        return good(seeds, n_updates, n_workers) * (math.nan if is_broken("_critic_loss") else 1)
+
+    monkeypatch.setattr(reliability, "run_small", run_small)
+    assert run_main(monkeypatch, "--fault", "unsupervised_locals") == 1
+    assert run_main(monkeypatch) == 0
 
 
 @pytest.mark.parametrize("found", [True, False])
