@@ -31,19 +31,20 @@ def test_order_is_seed_by_seed(tmp_path: Path) -> None:
         grid.jobs(only=["lve"])
 
 
-def test_method_wins_in_its_keyword_mappings_and_the_grid_elsewhere() -> None:
-    own = {"gamma": 0.9, "n_timesteps": 5, "env_kwargs": {"modalities": ["rgb"]}, "policy_kwargs": {"net_arch": [8]}}
+def test_method_wins_in_its_policy_kwargs_and_the_grid_elsewhere() -> None:
+    env_kwargs = {"modalities": ["rgb"], "image_size": 64}
+    own = {"gamma": 0.9, "n_timesteps": 5, "env_kwargs": env_kwargs, "policy_kwargs": {"net_arch": [8]}}
     given = {
         "gamma": 0.98,
         "tau": 0.1,
-        "env_kwargs": {"modalities": ["rgb", "event"], "image_size": 64},
+        "env_kwargs": {"image_size": 32, "vehicles_count": 3},
         "policy_kwargs": {"net_arch": [16], "precision": "bfloat16"},
         "replay_buffer_kwargs": {"n_stack": 2},
     }
     assert merge(own, given) == {
         "gamma": 0.98,
         "tau": 0.1,
-        "env_kwargs": {"modalities": ["rgb"], "image_size": 64},
+        "env_kwargs": {"modalities": ["rgb"], "image_size": 32, "vehicles_count": 3},
         "policy_kwargs": {"net_arch": [8], "precision": "bfloat16"},
         "replay_buffer_kwargs": {"n_stack": 2},
     }
@@ -79,11 +80,20 @@ def test_method_may_be_a_file(tmp_path: Path) -> None:
 
 
 def test_what_does_not_reach_a_method_is_told(tmp_path: Path) -> None:
-    given = {"env_kwargs": {"modalities": ["rgb", "event"], "vehicles_count": 3}}
+    given = {"policy_kwargs": {"net_arch": [8], "precision": "float32"}}
+    grid = read_grid(write(tmp_path, methods=["gve-wide", "have"], hyperparams=given))
+    own = {"pi": [256, 256], "qf": [454, 454]}
+    assert grid.overruled() == [f"gve-wide keeps its own policy_kwargs.net_arch: {own}, not [8]"]
+    with pytest.raises(GridError, match=r"policy_kwargs\.net_arch: \[8\] reaches no method"):
+        read_grid(write(tmp_path, methods=["gve-wide"], hyperparams=given))
+
+
+def test_image_size_of_the_grid_reaches_every_method(tmp_path: Path) -> None:
+    given = {"env_kwargs": {"image_size": 32}}
     grid = read_grid(write(tmp_path, methods=["rgb", "have"], hyperparams=given))
-    assert grid.overruled() == ["rgb keeps its own env_kwargs.modalities: ['rgb'], not ['rgb', 'event']"]
-    with pytest.raises(GridError, match=r"env_kwargs\.image_size: 32 reaches no method"):
-        read_grid(write(tmp_path, hyperparams={"env_kwargs": {"image_size": 32}}))
+    assert grid.overruled() == []
+    told = [(job.config["env_kwargs"]["image_size"], job.config["env_kwargs"]["modalities"]) for job in grid.jobs()]
+    assert told[:2] == [(32, ["rgb"]), (32, ["rgb", "event"])]
 
 
 @pytest.mark.parametrize(
@@ -108,6 +118,10 @@ def test_what_does_not_reach_a_method_is_told(tmp_path: Path) -> None:
         ({"hyperparams": {"batchsize": 3}}, "knows no 'batchsize'; did you mean 'batch_size'?"),
         ({"hyperparams": {"n_timesteps": 3}}, "hyperparams: n_timesteps does nothing here"),
         ({"hyperparams": {"env_kwargs": 3}}, "hyperparams: env_kwargs: expected keys and values, got 3"),
+        (
+            {"hyperparams": {"env_kwargs": {"modalities": ["rgb", "depth"]}}},
+            "put them under the grid's own key modalities: ['rgb', 'depth']",
+        ),
         ({"hyperparams": [3]}, "hyperparams: expected keys and values"),
         ({"failures": {"severity": 1}}, "failures: 'kinds' is missing"),
         ({"failures": {"kinds": ["blak"]}}, "failures: kinds: there is no 'blak'; did you mean 'black'?"),

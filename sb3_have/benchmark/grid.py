@@ -15,8 +15,9 @@ A grid is a YAML file; only ``methods`` and ``seeds`` have to be there::
     save_freq: 5000                # steps between checkpoints
     failures: {kinds: [black, frozen, noise], severity: 3, episodes: 1}   # after that; left out: none
 
-``hyperparams`` stand in the place of every method's own. Only ``env_kwargs`` and ``policy_kwargs`` are merged key by
-key, and there the method's win: they are what makes it that method. So ``modalities`` is a key of its own: it gives
+``hyperparams`` stand in the place of every method's own. Of ``env_kwargs`` and ``policy_kwargs`` only given keys do:
+``{env_kwargs: {image_size: 84}}`` leaves the rest as it was. In ``policy_kwargs`` a method's own keys stay, as they are
+what makes it that method. For the same reason ``modalities`` is a key of its own and not of ``env_kwargs``: it gives
 other sensors to every method that has several, and leaves ``rgb`` its one.
 """
 
@@ -38,9 +39,6 @@ from sb3_have.configuration import config_path, load_config
 from sb3_have.envs.weather import WEATHERS
 from sb3_have.sensors import SENSORS, failures_for
 from sb3_have.train import algorithm_of, algorithms
-
-MERGED = ("env_kwargs", "policy_kwargs")
-"""Hyper-parameters that a grid and a method share key by key."""
 
 NOT_OF_THE_MODEL = {"n_envs", "frame_stack", "env_kwargs", "env_wrapper"}
 OWN_ENVS = ("HighwayVision-v0", "CarlaVision-v0")
@@ -110,21 +108,21 @@ class Grid:
         return config
 
     def overruled(self) -> list[str]:
-        """What of ``hyperparams`` does not reach methods because their own configurations say otherwise.
+        """Which of the grid's ``policy_kwargs`` do not reach methods because those have their own.
 
-        :raises GridError: if it reaches none of them
+        :raises GridError: if one reaches none of them
         """
         told = []
-        given = [(part, key, value) for part in MERGED for key, value in self.hyperparams.get(part, {}).items()]
-        own = {method_name(method): load_config(method, self.env) for method in self.methods}
-        for part, key, value in given:
-            others = {name: mine.get(part, {}).get(key, value) for name, mine in own.items()}
-            others = {name: other for name, other in others.items() if other != value}
+        own = {method_name(m): load_config(m, self.env).get("policy_kwargs", {}) for m in self.methods}
+        for key, value in self.hyperparams.get("policy_kwargs", {}).items():
+            others = {name: mine[key] for name, mine in own.items() if mine.get(key, value) != value}
             if len(others) == len(own):
                 raise GridError(
-                    f"hyperparams: {part}.{key}: {value!r} reaches no method, all have their own; remove it"
+                    f"hyperparams: policy_kwargs.{key}: {value!r} reaches no method, all have their own; remove it"
                 )
-            told += [f"{name} keeps its own {part}.{key}: {other!r}, not {value!r}" for name, other in others.items()]
+            told += [
+                f"{name} keeps its own policy_kwargs.{key}: {other!r}, not {value!r}" for name, other in others.items()
+            ]
         return told
 
 
@@ -160,9 +158,10 @@ class Job:
 def merge(own: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> dict[str, Any]:
     """A method's configuration under a grid's ``hyperparams``, without ``n_timesteps``: the grid has ``steps``."""
     merged = {**own, **hyperparams}
-    for part in MERGED:
-        if part in merged:
-            merged[part] = {**hyperparams.get(part, {}), **own.get(part, {})}
+    if "env_kwargs" in merged:
+        merged["env_kwargs"] = {**own.get("env_kwargs", {}), **hyperparams.get("env_kwargs", {})}
+    if "policy_kwargs" in merged:
+        merged["policy_kwargs"] = {**hyperparams.get("policy_kwargs", {}), **own.get("policy_kwargs", {})}
     merged.pop("n_timesteps", None)
     return merged
 
@@ -214,9 +213,14 @@ def _check_whole(grid: Grid) -> None:
         raise GridError(f"weathers: there is no {unknown[0]!r}{_remedy(unknown[0], WEATHERS)}")
     if "n_timesteps" in grid.hyperparams:
         raise GridError("hyperparams: n_timesteps does nothing here; the steps of all runs are 'steps'")
-    for part in MERGED:
+    for part in ("env_kwargs", "policy_kwargs"):
         if not isinstance(grid.hyperparams.get(part, {}), dict):
             raise GridError(f"hyperparams: {part}: expected keys and values, got {grid.hyperparams[part]!r}")
+    if "modalities" in grid.hyperparams.get("env_kwargs", {}):
+        raise GridError(
+            "hyperparams: env_kwargs: modalities would give rgb several sensors; put them under the grid's own key "
+            f"modalities: {grid.hyperparams['env_kwargs']['modalities']!r}, which reaches the methods that have several"
+        )
     if grid.failures is not None and grid.failures.episodes > grid.final_episodes:
         raise GridError(
             f"failures: episodes: {grid.failures.episodes} is more than final_episodes, {grid.final_episodes}: "
