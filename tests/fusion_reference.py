@@ -115,7 +115,7 @@ def transfuser(maps: Sequence[Map], parameters: Parameters, n_layers: int, n_hea
             if modality == i:
                 out = layer_norm(token, parameters, "norm")
                 update[:, row, column] = (
-                    linear(out, parameters, f"outputs.{i}") if f"outputs.{i}.weight" in parameters else out
+                    parameters[f"outputs.{i}.weight"] @ out if f"outputs.{i}.weight" in parameters else out
                 )
         fused.append(image + resize(update, height, width))
     return fused

@@ -95,6 +95,22 @@ def test_gradients_reach_every_parameter_and_map(fusion: type[FeatureFusion], sh
     assert all((values.grad != 0).all() for values in inputs)  # type: ignore[union-attr]
 
 
+@pytest.mark.parametrize("shapes", SHAPES, ids=str)
+@pytest.mark.parametrize("fusion", FUSIONS)
+def test_nothing_is_added_at_first(fusion: type[FeatureFusion], shapes: list[Shape]) -> None:
+    """A new fusion gives the maps back to the bit; two updates later none of its parameters is where it began."""
+    th.manual_seed(0)
+    module, maps = fusion(shapes).double(), maps_of(shapes)
+    assert all(th.equal(*pair) for pair in zip(module(maps), maps, strict=True))
+    before, optimizer = clone_parameters(module), th.optim.Adam(module.parameters())
+    wanted = maps_of(shapes, seed=2)
+    for _ in range(2):
+        optimizer.zero_grad()
+        th.autograd.backward([(a - b).square().mean() for a, b in zip(module(maps), wanted, strict=True)])
+        optimizer.step()
+    assert changed(before, module) == set(before)
+
+
 @pytest.mark.parametrize("fusion", FUSIONS)
 def test_modalities_see_each_other_and_samples_do_not(fusion: type[FeatureFusion]) -> None:
     shapes = SHAPES[3]
@@ -140,8 +156,7 @@ def test_positions_are_of_tokens_and_modalities() -> None:
 @pytest.mark.parametrize("fusion", FUSIONS)
 def test_bfloat16_changes_little(fusion: type[FeatureFusion]) -> None:
     shapes: list[Shape] = [(32, 8, 8), (32, 8, 8)]
-    th.manual_seed(0)
-    module = fusion(shapes)
+    module = drawn(fusion, shapes).float()
     maps = [values.float().contiguous(memory_format=th.channels_last) for values in maps_of(shapes, 4)]
     exact = module(maps)
     with th.autocast("cpu", dtype=th.bfloat16):
@@ -238,6 +253,8 @@ def test_encoder_with_fusion(name: str, stages: str) -> None:
     space = two_images(names="rgb event depth")
     th.manual_seed(0)
     encoder = MultiModalEncoder(space, 8, precision="float32", fusion=name, fusion_kwargs={"stages": stages})
+    for parameter in encoder.fusions.parameters():
+        parameter.data.add_(th.randn_like(parameter), alpha=0.1)
     observations = sampled(space)
     features = encoder(observations)
     assert features.shape == (4, 3, 8)

@@ -4,6 +4,9 @@ Fusion of feature maps: image encoders that look at each other between their con
 Shapes: B batch, d modalities, and of modality i a map of C_i channels, H_i rows, W_i columns. A fusion comes after a
 stage (a convolution and its ReLU) of all encoders; each encoder then goes on with its own fused map, so that there are
 still d features, and everything that is done with features of modalities can be done with these.
+
+What a fusion adds to the maps is zero at first, so that learning begins as without it. By PyTorch's usual
+initialisation it would be several times to sixty times as large as the maps, which hides these for the first updates.
 """
 
 import math
@@ -69,8 +72,9 @@ class Transfuser(FeatureFusion):
         self.positions = nn.Parameter(th.randn(sum(self.sizes), width) * 0.02)
         self.layers = nn.ModuleList(TransformerLayer(width, n_heads, mlp_ratio) for _ in range(n_layers))
         self.norm = nn.LayerNorm(width)
+        nn.init.zeros_(self.norm.weight)  # nothing is added at first
         self.outputs = nn.ModuleList(
-            nn.Linear(width, shape[0]) if needed else nn.Identity()
+            nn.Linear(width, shape[0], bias=False) if needed else nn.Identity()  # the norm has a bias
             for shape, needed in zip(shapes, projected, strict=True)
         )
 
@@ -196,6 +200,8 @@ class _ChannelAttention(nn.Module):
         self.mlp = nn.Sequential(
             nn.Linear(channels, mlp_ratio * channels), nn.GELU(), nn.Linear(mlp_ratio * channels, channels)
         )
+        for parameter in (*self.projection.parameters(), *self.mlp[2].parameters()):
+            nn.init.zeros_(parameter)  # nothing is added at first
 
     def forward(self, image: th.Tensor, query: th.Tensor, key: th.Tensor, value: th.Tensor) -> th.Tensor:
         """Of a map and what :meth:`CrossModalChannelAttention._by_head` gives, keys and values of the others."""
