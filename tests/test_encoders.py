@@ -22,7 +22,7 @@ from envs import (
 from gymnasium import spaces
 from sb3_contrib import TQC
 from stable_baselines3 import SAC
-from stable_baselines3.common.torch_layers import NatureCNN
+from stable_baselines3.common.torch_layers import CombinedExtractor, NatureCNN
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
 from sb3_have import HAVESAC
@@ -329,6 +329,13 @@ def test_crossq_learns_from_a_dict_as_from_a_box() -> None:
     box, mapping = models
     assert changed(before, box.policy) == set(before)
     assert not changed(clone_parameters(box.policy), mapping.policy)
+
+
+def test_crossq_without_an_extractor_of_its_own_has_that_of_sb3() -> None:
+    space = spaces.Dict({"a": vector(4), "b": vector(3)})
+    model = MultiInputCrossQ("MultiInputPolicy", RandomSensors(space), learning_starts=8, batch_size=8, device="cpu")
+    assert type(model.critic.features_extractor) is CombinedExtractor
+    assert model.learn(12)._n_updates > 0
 
 
 @pytest.mark.parametrize("space", [sensors_space(), image(3)])

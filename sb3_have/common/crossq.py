@@ -8,8 +8,17 @@ from sb3_contrib import CrossQ
 from sb3_contrib.crossq.policies import CrossQPolicy
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
+
+
+class MultiInputPolicy(CrossQPolicy):
+    """CrossQ's policy with a features extractor for Dict observations by default; the parameters are CrossQPolicy's."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        kwargs.setdefault("features_extractor_class", CombinedExtractor)
+        super().__init__(*args, **kwargs)
 
 
 class MultiInputCrossQ(CrossQ):
@@ -17,8 +26,8 @@ class MultiInputCrossQ(CrossQ):
     CrossQ (Bhatt et al. 2024) that also knows ``"MultiInputPolicy"``; the algorithm is sb3-contrib's, untouched.
 
     Its training step joins observations and next observations by ``torch.cat``, as the joint batch statistics ask for;
-    here they come as dictionaries that ``torch.cat`` joins key by key. A features extractor for Dict observations has
-    to be given, such as :class:`~sb3_have.common.encoders.MultiModalExtractor`::
+    here they come as dictionaries that ``torch.cat`` joins key by key. The features extractor is SB3's
+    ``CombinedExtractor`` by default; with the encoders of HAVESAC it is::
 
         MultiInputCrossQ("MultiInputPolicy", env,
                          policy_kwargs=dict(features_extractor_class=MultiModalExtractor, normalize_images=False))
@@ -26,7 +35,7 @@ class MultiInputCrossQ(CrossQ):
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
         **CrossQ.policy_aliases,
-        "MultiInputPolicy": CrossQPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
     }
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
