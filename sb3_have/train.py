@@ -38,6 +38,7 @@ from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
 from sb3_have.common.crossq import MultiInputCrossQ
 from sb3_have.common.episodes import leave_interrupts_to_parent
 from sb3_have.common.evaluation import evaluate
+from sb3_have.common.files import locked, write_atomically
 from sb3_have.common.memory import keep_freed_memory
 from sb3_have.configuration import env_wrapper, evaluation_env_kwargs, hyperparameter, load_config, model_kwargs
 from sb3_have.envs.weather import WEATHERS
@@ -101,7 +102,6 @@ class RunCallback(BaseCallback):
     def _on_training_start(self) -> None:
         self._started = time.monotonic()
         self._earlier = self.run.seconds
-        self._last_step = self.num_timesteps
         # SB3 finishes the step it is in, then stops: the buffer and the optimizers stay whole
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
@@ -116,22 +116,18 @@ class RunCallback(BaseCallback):
     def _on_step(self) -> bool:
         run, step = self.run, self.num_timesteps
         run.seconds = self._earlier + time.monotonic() - self._started
-        if self._is_due(run.eval_freq):
+        # one that a stop keeps from being made is made up for when the run goes on
+        if run.is_due(run.eval_freq, step) and not self.stopping:
             self._in_evaluation = True
             try:
                 run.evaluate(self.model, step)
             except KeyboardInterrupt:
                 self.stopping = True
             self._in_evaluation = False
-        if self._is_due(run.save_freq):
+        if run.is_due(run.save_freq, step):
             run.save(self.model)
-        self._last_step = step
         out_of_time = run.time_limit is not None and time.monotonic() - self._started > run.time_limit
         return not (self.stopping or out_of_time)
-
-    def _is_due(self, frequency: int) -> bool:
-        # a step of n environments counts n, so it may jump over a multiple
-        return frequency > 0 and self.num_timesteps // frequency > self._last_step // frequency
 
     def restore_handlers(self) -> None:
         """Give the signals back to whoever had them."""
@@ -189,9 +185,20 @@ class Run:
         :param progress_bar: SB3's
         :param keep_checkpoint: whether to write the replay buffer at the end, so that the run can go on
         :return: the model; also saved as ``model.zip``
+        :raises BlockingIOError: if another process works in the folder
+        :raises ValueError: if the folder is of another run, or of one that cannot go on
         """
         self.out.mkdir(parents=True, exist_ok=True)
+        with locked(self.out):
+            return self._train(steps, progress_bar, keep_checkpoint)
+
+    def _train(self, steps: int, progress_bar: bool, keep_checkpoint: bool) -> OffPolicyAlgorithm:
         checkpoint = newest_checkpoint(self.out)
+        if checkpoint is None and (self.out / "model.zip").exists():
+            raise ValueError(
+                f"{self.out} has a model.zip but no checkpoint to go on from, and training would begin anew, over it; "
+                "choose another folder, or remove this one (a benchmark keeps checkpoints with --keep-checkpoints)"
+            )
         done = 0 if checkpoint is None else checkpoint_step(checkpoint)
         if checkpoint is not None:
             self._check_same_run(checkpoint)
@@ -199,13 +206,15 @@ class Run:
         env = make_training_env(self.env_id, self.config, self.out)
         try:
             model = self._make_model(checkpoint, env)
+            if done and self.is_due(self.eval_freq, done) and done not in self._evaluated():
+                self.evaluate(model, done)
             if done < steps:
                 self._learn(model, steps - done, progress_bar)
         finally:
             env.close()
         if keep_checkpoint and model.num_timesteps > done:
             self.save(model)
-        _write_atomically(self.out / "model.zip", model.save)
+        write_atomically(self.out / "model.zip", model.save)
         return model
 
     def _learn(self, model: OffPolicyAlgorithm, steps: int, progress_bar: bool) -> None:
@@ -244,6 +253,14 @@ class Run:
         model.set_random_seed(self.seed + model.num_timesteps)
         return model
 
+    def is_due(self, frequency: int, step: int) -> bool:
+        """Whether a step is the first at or past a multiple of a frequency: n environments go n steps at a time."""
+        return frequency > 0 and step // frequency > (step - self.config.get("n_envs", 1)) // frequency
+
+    def _evaluated(self) -> set[int]:
+        path = self.out / "evaluation.csv"
+        return set(pd.read_csv(path)["step"]) if path.exists() else set()
+
     def _settings(self) -> dict[str, Any]:
         config = {key: value for key, value in self.config.items() if key != "n_timesteps"}
         settings = {"config": config, "env_id": self.env_id, "seed": self.seed, "algo": self.algo}
@@ -259,18 +276,17 @@ class Run:
         for path in recorded:
             if path.name == "evaluation.csv":
                 rows = pd.read_csv(path)
-                _write_atomically(path, partial(rows[rows["step"] <= step].to_csv, index=False))
+                write_atomically(path, partial(rows[rows["step"] <= step].to_csv, index=False))
                 continue
             head, *lines = path.read_text().splitlines(keepends=True)
             rows = pd.read_csv(io.StringIO("".join(lines)))
             kept = int((rows["l"].cumsum() <= step / self.config.get("n_envs", 1)).sum())
-            _write_atomically(path, partial(Path.write_text, data="".join([head, *lines[: kept + 1]])))
+            write_atomically(path, partial(Path.write_text, data="".join([head, *lines[: kept + 1]])))
 
     def save(self, model: Any) -> None:
-        """Write ``checkpoint-<step>``: it appears complete or not at all, and then the older one goes."""
-        older = newest_checkpoint(self.out)
+        """Write ``checkpoint-<step>``: it appears complete or not at all, and then older ones go."""
         target = self.out / f"checkpoint-{model.num_timesteps}"
-        if target == older:
+        if target.exists():
             return
         partial = self.out / "checkpoint.partial"
         shutil.rmtree(partial, ignore_errors=True)
@@ -280,8 +296,9 @@ class Run:
         state = {"seconds": self.seconds, "settings": self._settings()}
         (partial / "state.json").write_text(json.dumps(state, indent=1))
         partial.rename(target)
-        if older is not None:
-            shutil.rmtree(older)
+        for older in self.out.glob("checkpoint-*"):
+            if older != target:
+                shutil.rmtree(older)
 
     def evaluate(self, model: Any, step: int) -> None:
         """Append a row per weather to ``evaluation.csv`` and print their mean."""
@@ -299,7 +316,9 @@ class Run:
         frame.insert(1, "seed", self.seed)
         frame.insert(2, "wall_time", round(self.seconds, 1))
         path = self.out / "evaluation.csv"
-        frame.to_csv(path, mode="a", header=not path.exists() or not path.stat().st_size, index=False)
+        before = path.read_text() if path.exists() else ""
+        rows = frame.to_csv(header=not before, index=False, lineterminator="\n")
+        write_atomically(path, partial(Path.write_text, data=before + rows))
         print(
             f"step {step}: return {frame['return_mean'].mean():.1f}, distance {frame['distance_mean'].mean():.0f} m "
             f"over {len(frame)} weathers, {self.seconds / 60:.1f} min",
@@ -315,12 +334,6 @@ def checkpoint_step(checkpoint: Path) -> int:
 def newest_checkpoint(out: Path) -> Path | None:
     """The complete checkpoint with the most steps, if any."""
     return max(out.glob("checkpoint-*"), key=checkpoint_step, default=None)
-
-
-def _write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
-    partial = path.with_name(f"partial-{path.name}")
-    write(partial)
-    partial.replace(path)
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -15,7 +15,7 @@ import pytest
 import yaml
 from fake_drive import CONFIG, ENV_ID
 
-from sb3_have import HAVESAC
+from sb3_have import HAVESAC, train
 from sb3_have.benchmark import results as results_module
 from sb3_have.benchmark import runner as runner_module
 from sb3_have.benchmark import stages
@@ -24,7 +24,7 @@ from sb3_have.benchmark.grid import Grid, GridError, Job, read_grid
 from sb3_have.benchmark.reading import read_results
 from sb3_have.benchmark.results import difference, is_finished, merge
 from sb3_have.benchmark.runner import FAILED, FINISHED, STOPPED, Runner
-from sb3_have.benchmark.stages import FINAL_SEED, collect, locked, run_job
+from sb3_have.benchmark.stages import FINAL_SEED, collect, run_job
 from sb3_have.common.evaluation import evaluate_episodes
 from sb3_have.train import EVALUATION_SEED, Run, algorithms, checkpoint_step, newest_checkpoint
 
@@ -344,6 +344,35 @@ def test_checkpoint_stays_only_if_asked_for(tmp_path: Path) -> None:
         run_job(make_grid(tmp_path, steps=50).jobs()[0], tmp_path)
 
 
+def test_training_past_the_grid_is_not_driven(tmp_path: Path) -> None:
+    job = make_grid(tmp_path).jobs()[0]
+    run = Run(job.config, ENV_ID, tmp_path / job.name, eval_freq=0)
+    run.train(31)
+    with pytest.raises(ValueError, match="trained to step 31, past the 30"):
+        run_job(job, tmp_path)
+    assert not (tmp_path / job.name / "final-30").exists()
+
+
+def test_stop_in_the_last_evaluation_is_a_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = make_grid(tmp_path, eval_freq=30).jobs()[0]
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "evaluate", lambda *args, **kwargs: os.kill(os.getpid(), signal.SIGINT))
+        assert not run_job(job, tmp_path)
+    assert newest_checkpoint(tmp_path / job.name) == tmp_path / job.name / "checkpoint-30"
+    assert run_job(job, tmp_path)
+
+
+def test_remains_of_a_checkpoint_are_in_nobodys_way(tmp_path: Path) -> None:
+    """As when a run was killed while it dropped one of two."""
+    job = make_grid(tmp_path).jobs()[0]
+    remains = tmp_path / job.name / "checkpoint.partial"
+    assert run_job(job, tmp_path, keep_checkpoint=True)
+    remains.mkdir()
+    (remains / "model.zip").touch()
+    assert run_job(job, tmp_path)
+    assert not [*(tmp_path / job.name).glob("checkpoint*")]
+
+
 def test_merge_that_is_cut_off_leaves_no_finished_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     results = tmp_path / "results"
     first, second, *_ = make_grid(tmp_path, failures={"kinds": ["black"]}).jobs()
@@ -360,7 +389,7 @@ def test_merge_that_is_cut_off_leaves_no_finished_run(tmp_path: Path, monkeypatc
 
         def write(path: Path, how: Any, cut: int = cut, written: list[Path] = written) -> None:
             if len(written) == cut:
-                how(path.with_name(f".partial-{path.name}"))
+                how(path.with_name(f"{path.name}.partial"))
                 raise OSError("no space left")
             written.append(path)
             whole(path, how)
@@ -369,7 +398,7 @@ def test_merge_that_is_cut_off_leaves_no_finished_run(tmp_path: Path, monkeypatc
         with pytest.raises(OSError, match="no space"):
             merge(results, second, tables[second.name])
         assert is_finished(results, first) and not is_finished(results, second)
-        after = {name: text for name, text in contents(results).items() if not name.startswith(".")}
+        after = {name: text for name, text in contents(results).items() if not name.endswith(".partial")}
         assert all(after[name].startswith(before[name]) for name in before), "what was there is whole"
     monkeypatch.setattr(results_module, "write_atomically", whole)
     merge(results, second, tables[second.name])
@@ -387,13 +416,6 @@ def test_file_is_whole_or_as_it_was(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="no space"):
         results_module.write_atomically(path, write_half)
     assert path.read_text() == "before"
-
-
-def test_folder_is_for_one_process(tmp_path: Path) -> None:
-    with locked(tmp_path), pytest.raises(BlockingIOError, match="another process works in"), locked(tmp_path, 0.0):
-        pass
-    with locked(tmp_path, 0.0):
-        pass
 
 
 def test_missing_ray_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,7 +1,9 @@
 """Training runs: resumed where they were, evaluations neither lost nor doubled, stopped in good order."""
 
+import fcntl
 import os
 import signal
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +15,7 @@ from fake_drive import CONFIG, ENV_ID
 
 import sb3_have
 from sb3_have import train
+from sb3_have.common import files
 from sb3_have.configuration import load_config, model_kwargs
 from sb3_have.train import Run, newest_checkpoint
 
@@ -87,11 +90,61 @@ def test_signal_ends_training_and_saves(
     assert signal.getsignal(number) == before
 
 
-def test_interrupt_during_an_evaluation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(train, "evaluate", lambda *args, **kwargs: os.kill(os.getpid(), signal.SIGINT))
-    run = make_run(tmp_path)
-    assert run.train(1000).num_timesteps == 10
-    assert run.interrupted and not (tmp_path / "evaluation.csv").exists()
+@pytest.mark.parametrize("steps", [10, 20])
+@pytest.mark.parametrize("moment", ["before", "within"])
+def test_evaluation_that_a_stop_prevents_is_made_up_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str, steps: int
+) -> None:
+    def stop(*args: Any, **kwargs: Any) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+
+    class Interrupted(train.RunCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 10:
+                stop()
+            return super()._on_step()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            train, "evaluate" if moment == "within" else "RunCallback", stop if moment == "within" else Interrupted
+        )
+        run = make_run(tmp_path)
+        assert run.train(steps).num_timesteps == 10
+        assert run.interrupted and not (tmp_path / "evaluation.csv").exists()
+    again = make_run(tmp_path)
+    again.train(steps)
+    assert list(pd.read_csv(tmp_path / "evaluation.csv")["step"]) == [10, 10, 20, 20][: 2 * steps // 10]
+    assert not again.interrupted
+
+
+def test_folder_is_for_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(train, "locked", partial(files.locked, patience=0.0))
+    with (tmp_path / ".lock").open("w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)  # as another process does
+        with pytest.raises(BlockingIOError, match="another process works in"):
+            make_run(tmp_path).train(8)
+    assert not (tmp_path / "model.zip").exists()
+    with files.locked(tmp_path), files.locked(tmp_path):  # once a process has it, it has it
+        assert make_run(tmp_path, eval_freq=0).train(8).num_timesteps == 8
+        with (tmp_path / ".lock").open("w") as other, pytest.raises(BlockingIOError):
+            fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    with (tmp_path / ".lock").open("w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def test_model_without_checkpoint_is_not_trained_over(tmp_path: Path) -> None:
+    make_run(tmp_path).train(12, keep_checkpoint=False)
+    with pytest.raises(ValueError, match=r"no checkpoint to go on from"):
+        make_run(tmp_path).train(12)
+    assert len(pd.read_csv(tmp_path / "evaluation.csv")) == 2
+
+
+def test_remains_of_older_checkpoints_go(tmp_path: Path) -> None:
+    """As when a run was killed while it removed one."""
+    make_run(tmp_path, eval_freq=0).train(8)
+    (tmp_path / "checkpoint-3").mkdir()
+    make_run(tmp_path, eval_freq=0).train(12)
+    assert [path.name for path in tmp_path.glob("checkpoint*")] == ["checkpoint-12"]
 
 
 def test_time_limit(tmp_path: Path) -> None:

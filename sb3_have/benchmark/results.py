@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -12,16 +11,10 @@ import pandas as pd
 
 from sb3_have.benchmark.grid import GridError, Job
 from sb3_have.benchmark.reading import FILES
+from sb3_have.common.files import write_atomically
 
 RUN_FILES = ("evaluations", "final", "episodes", "weights", "failures", "runs")
 """What a run adds to, in the order of writing: the row in ``runs.csv`` says that the others are there."""
-
-
-def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
-    """Write a file so that it is whole or, if the process dies, still as it was."""
-    partial_path = path.with_name(f".partial-{path.name}")
-    write(partial_path)
-    partial_path.replace(path)
 
 
 def read_text_table(path: Path) -> pd.DataFrame:

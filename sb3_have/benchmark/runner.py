@@ -25,7 +25,8 @@ from tqdm import tqdm
 from sb3_have.benchmark.grid import Grid, GridError, Job, read_grid
 from sb3_have.benchmark.pool import RayPool
 from sb3_have.benchmark.results import is_finished, merge
-from sb3_have.benchmark.stages import collect, locked, steps_done
+from sb3_have.benchmark.stages import collect, steps_done
+from sb3_have.common.files import locked
 
 RETRIES = 2
 REFRESH_SECONDS = 2.0
@@ -219,7 +220,7 @@ def main(arguments: list[str] | None = None) -> int:
         runs = (args.runs or Path("runs") / grid.name).resolve()
         results = (args.results or Path("benchmarks") / "results" / grid.name).resolve()
         results.mkdir(parents=True, exist_ok=True)
-        with locked(results, patience=5.0):
+        with locked(results):
             runner = Runner(jobs, runs, results, args.retries, args.time_limit)
             print(describe(grid, jobs, runner), flush=True)
             if runner.is_done:

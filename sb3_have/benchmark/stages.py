@@ -10,12 +10,9 @@ All of it goes into the run's folder, step by step and each step whole, so that 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import json
-import os
 import shutil
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -28,9 +25,10 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_have import HAVESAC
 from sb3_have.benchmark.grid import Failures, Job
 from sb3_have.benchmark.reading import FILES
-from sb3_have.benchmark.results import difference, read_text_table, settings_column, write_atomically
+from sb3_have.benchmark.results import difference, read_text_table, settings_column
 from sb3_have.common.episodes import EpisodeQueue, Task, match_observations
 from sb3_have.common.evaluation import evaluate_episodes, summarize
+from sb3_have.common.files import locked, write_atomically
 from sb3_have.common.machine import machine
 from sb3_have.configuration import Env, env_wrapper, evaluation_env_kwargs
 from sb3_have.sensors import SENSORS, SensorFailure, failures_for
@@ -59,7 +57,7 @@ def run_job(job: Job, runs: Path, device: str = "cpu", keep_checkpoint: bool = F
     """
     folder = runs / job.name
     folder.mkdir(parents=True, exist_ok=True)
-    with locked(folder):
+    with locked(folder, LOCK_SECONDS):
         model = trained(job, folder, device)
         if model is None:
             return False
@@ -73,29 +71,6 @@ def run_job(job: Job, runs: Path, device: str = "cpu", keep_checkpoint: bool = F
     return True
 
 
-@contextlib.contextmanager
-def locked(folder: Path, patience: float = LOCK_SECONDS) -> Iterator[None]:
-    """Have a folder for oneself; the lock goes with the process, however it ends.
-
-    :param folder: to lock
-    :param patience: seconds to wait for another process to end
-    :raises BlockingIOError: if it does not
-    """
-    handle, start = os.open(folder, os.O_RDONLY), time.monotonic()
-    try:
-        while True:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if time.monotonic() - start > patience:
-                    raise BlockingIOError(f"another process works in {folder}; end it, or wait for it") from None
-                time.sleep(0.5)
-        yield
-    finally:
-        os.close(handle)
-
-
 def final_folder(job: Job, folder: Path) -> Path:
     """Where a run keeps what it did after its training."""
     return folder / f"final-{job.grid.steps}"
@@ -106,12 +81,6 @@ def trained(job: Job, folder: Path, device: str) -> OffPolicyAlgorithm | None:
     record = final_folder(job, folder) / "training.json"
     if record.exists():
         return _reload(job, folder, json.loads(record.read_text()), device)
-    if newest_checkpoint(folder) is None and (folder / "model.zip").exists():
-        # training would begin anew, over what is there
-        raise ValueError(
-            f"{folder} is of a run that ended elsewhere and has no checkpoint to go on from; choose another --runs, or "
-            "remove it (--keep-checkpoints leaves them to runs that will be made longer)"
-        )
     grid = job.grid
     run = Run(
         job.config,
@@ -126,8 +95,13 @@ def trained(job: Job, folder: Path, device: str) -> OffPolicyAlgorithm | None:
         device=device,
     )
     model = run.train(grid.steps)
-    if model.num_timesteps < grid.steps:
+    if run.interrupted or model.num_timesteps < grid.steps:
         return None
+    if model.num_timesteps - grid.steps >= job.config.get("n_envs", 1):
+        raise ValueError(
+            f"{folder} has been trained to step {model.num_timesteps}, past the {grid.steps} at which it should be "
+            "driven; choose another --runs"
+        )
     record.parent.mkdir(exist_ok=True)
     told = {"settings": job.settings, "steps": model.num_timesteps, "minutes": round(run.seconds / 60, 2)}
     told |= {"parameters": n_parameters(model), **machine(device)}
@@ -148,9 +122,11 @@ def _reload(job: Job, folder: Path, record: dict[str, Any], device: str) -> OffP
 
 
 def _drop_checkpoints(folder: Path) -> None:
+    remains = folder / "checkpoint.partial"
+    shutil.rmtree(remains, ignore_errors=True)
     for checkpoint in folder.glob("checkpoint-*"):
         # renamed first: half a checkpoint must not look like a whole one
-        shutil.rmtree(checkpoint.rename(folder / "checkpoint.partial"))
+        shutil.rmtree(checkpoint.rename(remains))
 
 
 def n_parameters(model: OffPolicyAlgorithm) -> int:
