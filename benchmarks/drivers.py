@@ -1,0 +1,83 @@
+"""Drivers that did not learn, over the very episodes of a grid's final evaluation, for its report to compare with.
+
+    python -m benchmarks.drivers benchmarks/grids/core.yml
+
+They are a random one, one that goes straight on at 20 m/s, and highway-env's own, which sees all traffic (IDM/MOBIL).
+Writes ``drivers.csv`` beside the results of the agents.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import gymnasium as gym
+import pandas as pd
+
+from sb3_have.benchmark.grid import Grid, read_grid
+from sb3_have.benchmark.reading import FILES
+from sb3_have.benchmark.stages import DIGITS, FINAL_SEED
+from sb3_have.common.drivers import KeepStraightDriver, RandomDriver
+from sb3_have.common.episodes import Predictor
+from sb3_have.common.evaluation import evaluate
+from sb3_have.common.files import write_atomically
+from sb3_have.configuration import evaluation_env_kwargs
+
+IDM_ID = "benchmarks.drivers:RuleDriven-v0"
+"""HighwayVision-v0 that drives by itself; the module in front registers it in processes of its own too."""
+
+if "RuleDriven-v0" not in gym.registry:
+    of_agents = gym.spec("HighwayVision-v0")
+    gym.register(
+        "RuleDriven-v0",
+        "benchmarks.rule_driven:RuleDrivenEnv",
+        max_episode_steps=of_agents.max_episode_steps,
+        kwargs=of_agents.kwargs,
+        additional_wrappers=of_agents.additional_wrappers,
+    )
+
+
+def drive(grid: Grid, processes: int = 1) -> pd.DataFrame:
+    """Each driver in each weather, in the environment of the grid's first method.
+
+    :param grid: on HighwayVision-v0
+    :param processes: that drive; the random driver's actions depend on their number
+    :return: rows of ``drivers.csv``
+    :raises ValueError: if the grid has another environment
+    """
+    if grid.env != "HighwayVision-v0":
+        raise ValueError(f"these drivers know HighwayVision-v0 alone, not {grid.env}, the env of the grid")
+    env_kwargs = evaluation_env_kwargs(grid.jobs()[0].config)
+    drivers: dict[str, tuple[Predictor, str]] = {
+        "random": (RandomDriver(0), grid.env),
+        "straight at 20 m/s": (KeepStraightDriver(20.0), grid.env),
+        "IDM/MOBIL": (RandomDriver(0), IDM_ID),  # its actions are not heeded
+    }
+    parts = []
+    for name, (driver, env_id) in drivers.items():
+        rows = evaluate(driver, env_id, grid.weathers, grid.final_episodes, FINAL_SEED, env_kwargs, n_envs=processes)
+        print(
+            f"{name}: return {rows['return_mean'].mean():.1f}, distance {rows['distance_mean'].mean():.0f} m",
+            flush=True,
+        )
+        parts.append(rows.assign(driver=name))
+    return pd.concat(parts)[[*FILES["drivers"].columns]].round(DIGITS)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write ``drivers.csv``."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.drivers", description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("grid", type=Path, help="YAML file, see sb3_have.benchmark.grid")
+    parser.add_argument("--results", type=Path, help="default: benchmarks/results/<name of the grid>")
+    parser.add_argument("--processes", type=int, default=1, help="that drive")
+    args = parser.parse_args(arguments)
+    grid = read_grid(args.grid)
+    results = args.results or Path("benchmarks") / "results" / grid.name
+    results.mkdir(parents=True, exist_ok=True)
+    write_atomically(results / "drivers.csv", partial(drive(grid, args.processes).to_csv, index=False))
+
+
+if __name__ == "__main__":
+    main()
