@@ -211,6 +211,8 @@ def _check_whole(grid: Grid) -> None:
             raise GridError(f"{key}: {twice[0]!r} is there twice; every one may stand there once")
     if grid.env in OWN_ENVS and (unknown := [weather for weather in grid.weathers if weather not in WEATHERS]):
         raise GridError(f"weathers: there is no {unknown[0]!r}{_remedy(unknown[0], WEATHERS)}")
+    if grid.env in OWN_ENVS and (unknown := [name for name in grid.modalities if name not in SENSORS]):
+        raise GridError(f"modalities: there is no {unknown[0]!r}{_remedy(unknown[0], SENSORS)}")
     if "n_timesteps" in grid.hyperparams:
         raise GridError("hyperparams: n_timesteps does nothing here; the steps of all runs are 'steps'")
     for part in ("env_kwargs", "policy_kwargs"):
@@ -304,6 +306,23 @@ def _mapping(value: Any) -> dict[str, Any]:
     return value
 
 
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _hyperparams(value: Any) -> dict[str, Any]:
+    for key, item in _mapping(value).items():
+        if isinstance(item, dict):
+            _hyperparams(item)
+        if isinstance(item, str) and _is_number(item):
+            raise GridError(f"{key}: {item} is a word in YAML; write !!float {item}")
+    return dict(value)
+
+
 def _kind(value: Any) -> str:
     known = {kind for sensor in SENSORS for kind in failures_for(sensor)}
     if value not in known:
@@ -328,7 +347,7 @@ GRID_KEYS: dict[str, Reader] = {
     "seeds": _list_of("whole numbers >= 0", _whole(0)),
     "weathers": _list_of("names", _text),
     "modalities": _list_of("names", _text),
-    "hyperparams": _mapping,
+    "hyperparams": _hyperparams,
     "eval_freq": _whole(0),
     "eval_episodes": _whole(1),
     "final_episodes": _whole(1),
