@@ -25,6 +25,7 @@ from sb3_have.benchmark.reading import read_results
 from sb3_have.benchmark.results import difference, is_finished, merge
 from sb3_have.benchmark.runner import FAILED, FINISHED, STOPPED, Runner
 from sb3_have.benchmark.stages import FINAL_SEED, collect, run_job
+from sb3_have.common import files
 from sb3_have.common.evaluation import evaluate_episodes
 from sb3_have.train import EVALUATION_SEED, Run, algorithms, checkpoint_step, newest_checkpoint
 
@@ -220,6 +221,12 @@ def test_run_that_dies_again_is_left_and_told(
     assert "out of luck" in path.read_text()
 
 
+def test_run_that_others_stop_is_told(tmp_path: Path, unexamined: None) -> None:
+    runner = Runner(make_grid(tmp_path).jobs()[:1], tmp_path / "runs", tmp_path, retries=1)
+    assert runner.run(LocalPool(lambda job: False)) == FAILED
+    assert "stopped from outside" in (tmp_path / "runs" / "gve-0" / "traceback.txt").read_text()
+
+
 @pytest.mark.parametrize("cause", ["SIGINT", "SIGTERM", "time limit"])
 def test_stop_asks_all_runs_to_save(
     tmp_path: Path, unexamined: None, cause: str, capsys: pytest.CaptureFixture[str]
@@ -382,7 +389,7 @@ def test_merge_that_is_cut_off_leaves_no_finished_run(tmp_path: Path, monkeypatc
         tables[job.name] = collect(job, tmp_path / job.name)
     merge(results, first, tables[first.name])
     before = contents(results)
-    whole = results_module.write_atomically
+    whole = files.write_atomically
 
     for cut in range(6):
         written: list[Path] = []
@@ -414,7 +421,7 @@ def test_file_is_whole_or_as_it_was(tmp_path: Path) -> None:
     path = tmp_path / "rows.csv"
     path.write_text("before")
     with pytest.raises(OSError, match="no space"):
-        results_module.write_atomically(path, write_half)
+        files.write_atomically(path, write_half)
     assert path.read_text() == "before"
 
 

@@ -125,19 +125,18 @@ class Runner:
             if not self.stopping:  # it was stopped by somebody else
                 return self._again(job, "it was stopped from outside")
             return f"{job.name}: stopped at step {steps_done(self.runs / job.name)}"
-        path = self.runs / job.name / "traceback.txt"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(f"{outcome}\n")
-        lines = str(outcome).strip().splitlines()
-        return self._again(job, lines[-1] if lines else type(outcome).__name__)
+        return self._again(job, str(outcome).strip() or type(outcome).__name__)
 
     def _again(self, job: Job, reason: str) -> str:
+        path = self.runs / job.name / "traceback.txt"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(f"{reason}\n")
         self._attempts[job.name] += 1
         attempt, attempts = self._attempts[job.name], self.retries + 1
-        told = f"{job.name} died ({reason})"
+        told = f"{job.name} died ({reason.splitlines()[-1]})"
         if attempt == attempts:
             self.failed.append(job.name)
-            return f"{told} for the {attempt}. time, and is left; see {self.runs / job.name / 'traceback.txt'}"
+            return f"{told} for the {attempt}. time, and is left; see {path}"
         self._todo.appendleft(job)
         return f"{told} and goes on from its checkpoint, attempt {attempt + 1} of {attempts}"
 
