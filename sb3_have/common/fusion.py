@@ -6,7 +6,7 @@ stage (a convolution and its ReLU) of all encoders; each encoder then goes on wi
 still d features, and everything that is done with features of modalities can be done with these.
 
 What a fusion adds to the maps is zero at first, so that learning begins as without it. By PyTorch's usual
-initialisation it would be several times to sixty times as large as the maps, which hides these for the first updates.
+initialisation it would be 4 to 60 times as large as the maps after the last convolution, and hide them.
 """
 
 import math
