@@ -26,7 +26,7 @@ import pandas as pd
 
 from benchmarks.measure import RESULTS
 from benchmarks.reliability_report import report
-from benchmarks.reliability_runs import METHODS, run
+from benchmarks.reliability_runs import METHODS, VARIANTS, run
 
 DEFAULT_METHODS = ("gve", "gve-wide", "lve", "have", "have-dropout", "have-unsupervised")
 N_UPDATES = 8000
@@ -102,7 +102,7 @@ def missing(rows: pd.DataFrame, methods: Sequence[str], n_seeds: int, n_updates:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(DEFAULT_METHODS))
+    parser.add_argument("--methods", nargs="+", choices=[*METHODS, *VARIANTS], default=list(DEFAULT_METHODS))
     parser.add_argument("--seeds", type=int, default=8, help="how many, from 0 on")
     parser.add_argument("--updates", type=int, default=N_UPDATES)
     parser.add_argument("--workers", type=int, default=2)

@@ -12,6 +12,7 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
+from benchmarks import variants
 from benchmarks.known_q import Floats, auc
 from benchmarks.reliability_vec_env import ReliabilityDriveVecEnv
 from sb3_have import HAVESAC
@@ -31,6 +32,25 @@ METHODS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     }
 )
 """What a method gives to HAVESAC; all else is the same for all."""
+VARIANTS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {
+        "have-coef-0.25": {"local_coef": 0.25},
+        "have-coef-4": {"local_coef": 4.0},
+        "have-min-before": {"policy": variants.MinBeforeMixing},
+        "have-detached-keys": {"policy": variants.DetachedKeys},
+        "have-detached-attention": {"policy": variants.DetachedAttention},
+        "have-temperature-0.5": {"policy": variants.HalfTemperature},
+        "have-temperature-2": {"policy": variants.DoubleTemperature},
+        "have-dropout-0.1": {"modality_dropout": 0.1},
+        "have-dropout-0.4": {"modality_dropout": 0.4},
+        "have-flat": {"policy": variants.FlatAttention},
+        "have-residual": {"policy": variants.GlobalResidual},
+        "have-competing": {"algorithm": variants.CompetingWeights},
+        "lve-competing": {"algorithm": variants.CompetingWeights, "value_estimation": "lve"},
+        "lve-dropout": {"value_estimation": "lve", "modality_dropout": 0.2},
+    }
+)
+"""Forms for ``benchmarks/STUDY.md``, likewise; ``policy`` and ``algorithm`` stand in the place of HAVESAC's own."""
 N_MODALITIES = 3
 N_ENVS = 8
 UPDATES_PER_STEP = 4
@@ -100,15 +120,17 @@ class Drive:
 
 def make_model(method: str, seed: int, **kwargs: Any) -> HAVESAC:
     """
-    :param method: one of ``METHODS``
+    :param method: one of ``METHODS`` or ``VARIANTS``
     :param seed: of networks, environments and exploration
     :param kwargs: of HAVESAC, in place of the method's own
     """
-    settings = {**HYPERPARAMETERS, **METHODS[method], "policy_kwargs": policy_kwargs(WIDTH)}
+    settings = {**HYPERPARAMETERS, **{**METHODS, **VARIANTS}[method], "policy_kwargs": policy_kwargs(WIDTH)}
+    algorithm, policy = settings.pop("algorithm", HAVESAC), settings.pop("policy", "MultiInputPolicy")
     if method.startswith("gve-wide"):
         settings["policy_kwargs"] = policy_kwargs(gve_width())
     env = ReliabilityDriveVecEnv(N_ENVS, n_modalities=N_MODALITIES)
-    return HAVESAC("MultiInputPolicy", env, seed=seed, device="cpu", **{**settings, **kwargs})
+    model: HAVESAC = algorithm(policy, env, seed=seed, device="cpu", **{**settings, **kwargs})
+    return model
 
 
 def policy_kwargs(width: int) -> dict[str, Any]:
@@ -138,7 +160,7 @@ def run(method: str, seed: int, n_updates: int) -> dict[str, float]:
     """
     Trains one method and measures it.
 
-    :param method: one of ``METHODS``
+    :param method: one of ``METHODS`` or ``VARIANTS``
     :param seed: of the training; the episodes of the evaluations are the same for all
     :param n_updates: of the critic
     :return: measures by name, NaN where a method has no such part:
@@ -250,7 +272,7 @@ def negative_gradient(model: HAVESAC, n_samples: int = 2000) -> float:
     """
     Share of sampled transitions (and twins) in which the value falls as the global or the weighted local value rises.
     """
-    if model.critic.value_estimation != "have":
+    if not hasattr(model.critic, "refusion"):
         return float("nan")
     assert model.replay_buffer is not None
     batch = model.replay_buffer.sample(n_samples)
