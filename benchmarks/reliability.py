@@ -3,11 +3,13 @@
     python -m benchmarks.reliability                          # 8 seeds of six methods, on two cores
     python -m benchmarks.reliability --methods have gve-wide --seeds 3 --updates 4000 --out /tmp/reliability
     python -m benchmarks.reliability --report                 # only the statistics of the runs that are there
+    python -m benchmarks.reliability --n-blind 8 --corruption 0.3    # each modality shows a third of the state only
 
 Each run is trained by HAVESAC with the same hyper-parameters (``benchmarks.reliability_runs``); ``gve-wide`` has a
 global critic as large as all of HAVE's. When a run ends, its measures become rows of ``<out>/<method>.csv``: method,
 seed, number of updates, measure, value. Runs that are there are not repeated, so that the command can be stopped and
-given again; a run that was under way begins anew. Then it prints the statistics and writes them to ``<out>/report.md``.
+given again; a run that was under way begins anew. Then it prints the statistics; ``--report`` writes them to
+``<out>/report.md`` too.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 
@@ -31,6 +34,7 @@ from benchmarks.reliability_runs import METHODS, VARIANTS, run
 DEFAULT_METHODS = ("gve", "gve-wide", "lve", "have", "have-dropout", "have-unsupervised")
 N_UPDATES = 8000
 OUT = RESULTS / "reliability"
+STANDARD_TASK = {"n_blind": 2, "corruption": 0.6}
 COLUMNS = ["method", "seed", "updates", "measure", "value"]
 
 
@@ -50,17 +54,17 @@ def run_small(seeds: Sequence[int] = (0, 1), n_updates: int = 2000, n_workers: i
 
 
 def run_all(
-    runs: Sequence[tuple[str, int]], n_updates: int, n_workers: int
+    runs: Sequence[tuple[str, int]], n_updates: int, n_workers: int, task: Mapping[str, Any] | None = None
 ) -> Iterator[list[tuple[str, int, int, str, float]]]:
-    """Rows of each run (method, seed) as it ends, in the order in which they end."""
+    """Rows of each run (method, seed) on a task as it ends, in the order in which they end."""
     if n_workers == 1:
         for method, seed in runs:
-            yield _run(method, seed, n_updates)
+            yield _run(method, seed, n_updates, task)
         return
     # Fresh processes: torch's threads do not survive a fork
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(n_workers, mp_context=context) as pool:
-        futures = [pool.submit(_run, method, seed, n_updates) for method, seed in runs]
+        futures = [pool.submit(_run, method, seed, n_updates, task) for method, seed in runs]
         try:
             for future in as_completed(futures):
                 yield future.result()
@@ -70,9 +74,11 @@ def run_all(
                 worker.terminate()
 
 
-def _run(method: str, seed: int, n_updates: int) -> list[tuple[str, int, int, str, float]]:
+def _run(
+    method: str, seed: int, n_updates: int, task: Mapping[str, Any] | None = None
+) -> list[tuple[str, int, int, str, float]]:
     start = time.perf_counter()
-    measures = run(method, seed, n_updates)
+    measures = run(method, seed, n_updates, task)
     measures["seconds"] = time.perf_counter() - start
     return [(method, seed, n_updates, measure, value) for measure, value in measures.items()]
 
@@ -106,20 +112,27 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, default=8, help="how many, from 0 on")
     parser.add_argument("--updates", type=int, default=N_UPDATES)
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--out", type=Path, default=OUT)
-    parser.add_argument("--report", action="store_true", help="make no runs")
+    parser.add_argument("--n-blind", type=int, default=2, help="directions of the state a modality does not see")
+    parser.add_argument("--corruption", type=float, default=0.6, help="probability with which a modality fails")
+    parser.add_argument("--out", type=Path, help="folder; by default one for each task")
+    parser.add_argument("--report", action="store_true", help="make no runs, write <out>/report.md")
     args = parser.parse_args(arguments)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("stopped"))  # as by Ctrl-C: the workers are to end too
+    task = {"n_blind": args.n_blind, "corruption": args.corruption}
+    if args.out is None:
+        name = f"n_blind-{args.n_blind}-corruption-{args.corruption:g}"
+        args.out = OUT if task == STANDARD_TASK else OUT / name
     todo = [] if args.report else missing(load(args.out), args.methods, args.seeds, args.updates)
-    for i, rows in enumerate(run_all(todo, args.updates, args.workers), 1):
+    for i, rows in enumerate(run_all(todo, args.updates, args.workers, task), 1):
         save(rows, args.out)
         told = {measure: value for _, _, _, measure, value in rows}
         print(f"{i}/{len(todo)} {rows[0][0]}-{rows[0][1]}: {_summary(told)}", flush=True)
     table = load(args.out)
     chosen = table["updates"].eq(args.updates) & table["method"].isin(args.methods) & table["seed"].lt(args.seeds)
     text = report(table[chosen])
-    (args.out / "report.md").write_text(text)
     print(text)
+    if args.report:
+        (args.out / "report.md").write_text(text)
 
 
 def _summary(measures: Mapping[str, float]) -> str:

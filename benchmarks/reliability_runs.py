@@ -118,17 +118,18 @@ class Drive:
         return float(((difference > 0) + 0.5 * (difference == 0))[pairs].mean())
 
 
-def make_model(method: str, seed: int, **kwargs: Any) -> HAVESAC:
+def make_model(method: str, seed: int, task: Mapping[str, Any] | None = None, **kwargs: Any) -> HAVESAC:
     """
     :param method: one of ``METHODS`` or ``VARIANTS``
     :param seed: of networks, environments and exploration
+    :param task: options of the environment
     :param kwargs: of HAVESAC, in place of the method's own
     """
     settings = {**HYPERPARAMETERS, **{**METHODS, **VARIANTS}[method], "policy_kwargs": policy_kwargs(WIDTH)}
     algorithm, policy = settings.pop("algorithm", HAVESAC), settings.pop("policy", "MultiInputPolicy")
     if method.startswith("gve-wide"):
         settings["policy_kwargs"] = policy_kwargs(gve_width())
-    env = ReliabilityDriveVecEnv(N_ENVS, n_modalities=N_MODALITIES)
+    env = ReliabilityDriveVecEnv(N_ENVS, n_modalities=N_MODALITIES, **(task or {}))
     model: HAVESAC = algorithm(policy, env, seed=seed, device="cpu", **{**settings, **kwargs})
     return model
 
@@ -156,13 +157,14 @@ def gve_width() -> int:
     return low
 
 
-def run(method: str, seed: int, n_updates: int) -> dict[str, float]:
+def run(method: str, seed: int, n_updates: int, task: Mapping[str, Any] | None = None) -> dict[str, float]:
     """
     Trains one method and measures it.
 
     :param method: one of ``METHODS`` or ``VARIANTS``
     :param seed: of the training; the episodes of the evaluations are the same for all
     :param n_updates: of the critic
+    :param task: options of the environment, ``n_blind`` and ``corruption``
     :return: measures by name, NaN where a method has no such part:
         ``return_<n>`` mean return after n updates, ``final_return`` the last of them and ``area`` their mean;
         ``weight_auc`` and ``weight_auc_in_step``, see :class:`Drive`;
@@ -172,20 +174,21 @@ def run(method: str, seed: int, n_updates: int) -> dict[str, float]:
         ``parameters`` of encoders and critics
     """
     th.set_num_threads(1)
-    model = make_model(method, seed)
+    task = dict(task or {})
+    model = make_model(method, seed, task)
     measures: dict[str, float] = {}
     for i in range(N_EVALUATIONS):
         due = n_updates * (i + 1) // N_EVALUATIONS
         steps = (due - model._n_updates) // UPDATES_PER_STEP + (WARM_UP if i == 0 else 0)
         model.learn(steps * N_ENVS, reset_num_timesteps=i == 0)
-        drive = evaluate(model)
+        drive = evaluate(model, **task)
         measures[f"return_{due}"] = float(drive.returns.mean())
     measures["final_return"] = list(measures.values())[-1]
     measures["area"] = float(np.mean(list(measures.values())[:N_EVALUATIONS]))
     measures |= {"weight_auc": drive.weight_auc(), "weight_auc_in_step": drive.weight_auc_in_step()}
-    bias, correlation = value_errors(model)
+    bias, correlation = value_errors(model, **task)
     measures |= {"value_bias": bias, "value_correlation": correlation, "negative_gradient": negative_gradient(model)}
-    return {**measures, **kept_returns(model), "parameters": sum(p.numel() for p in model.critic.parameters())}
+    return {**measures, **kept_returns(model, **task), "parameters": sum(p.numel() for p in model.critic.parameters())}
 
 
 def evaluate(model: HAVESAC, n_episodes: int = N_EPISODES, seed: int = EVALUATION_SEED, **options: Any) -> Drive:
@@ -217,19 +220,22 @@ def evaluate(model: HAVESAC, n_episodes: int = N_EPISODES, seed: int = EVALUATIO
     return Drive(rewards, steps, reliable, None if _is_gve(model) else weights)
 
 
-def kept_returns(model: HAVESAC) -> dict[str, float]:
+def kept_returns(model: HAVESAC, **options: Any) -> dict[str, float]:
     """``clean_return``, and for each kind of failure the share of it that is kept, see :func:`run`."""
-    clean = float(evaluate(model, corruption=0.0).returns.mean())
+    options = {**options, "corruption": 0.0}
+    clean = float(evaluate(model, **options).returns.mean())
     measures = {"clean_return": clean}
     for kind in FAILURES:
         returns = [
-            evaluate(model, corruption=0.0, failure=(modality, kind)).returns.mean() for modality in range(N_MODALITIES)
+            evaluate(model, failure=(modality, kind), **options).returns.mean() for modality in range(N_MODALITIES)
         ]
         measures[f"kept_{kind}"] = float(np.mean(returns)) / clean
     return measures
 
 
-def value_errors(model: HAVESAC, n_episodes: int = N_EPISODES, n_steps: int = 200) -> tuple[float, float]:
+def value_errors(
+    model: HAVESAC, n_episodes: int = N_EPISODES, n_steps: int = 200, **options: Any
+) -> tuple[float, float]:
     """
     The critic against Monte-Carlo returns of the policy that it evaluates, the stochastic one with its entropy:
     G_t = r_t + gamma (1 - end_t) (G_{t+1} - alpha log pi(a_{t+1})).
@@ -239,7 +245,7 @@ def value_errors(model: HAVESAC, n_episodes: int = N_EPISODES, n_steps: int = 20
 
     :return: bias, the mean of min_k Q_k - G over the standard deviation of G, and Pearson's correlation
     """
-    env = ReliabilityDriveVecEnv(n_episodes, n_modalities=N_MODALITIES, max_episode_steps=2 * n_steps + 1)
+    env = ReliabilityDriveVecEnv(n_episodes, n_modalities=N_MODALITIES, max_episode_steps=2 * n_steps + 1, **options)
     env.seed(EVALUATION_SEED)
     observation = env.reset()
     alpha = float(model.ent_coef_tensor if model.log_ent_coef is None else model.log_ent_coef.detach().exp())

@@ -21,7 +21,6 @@ from sb3_have.envs.reliability_drive import (
     FAILURE_NOISE,
     MAX_VALUE,
     MEAN_SEGMENT,
-    N_BLIND,
     N_STATE,
     OCTAVES,
     SENSOR_NOISE,
@@ -114,13 +113,21 @@ def test_seed_decides_everything() -> None:
 
 @pytest.mark.parametrize("n_modalities", [2, 3, 6])
 def test_one_modality_is_not_enough_and_two_are(n_modalities: int) -> None:
-    """Each is blind to ``N_BLIND`` directions of the state; any two of them see all."""
-    weight = Encoding.draw(n_modalities, seed=0).weight
+    """Each is blind to two directions of the state; any two of them see all."""
+    weight = DriveBatch(1, n_modalities=n_modalities).encoding.weight
     assert weight.shape == (n_modalities, N_STATE, CHANNELS)
     for i, j in itertools.combinations(range(n_modalities), 2):
-        assert np.linalg.matrix_rank(weight[i]) == N_STATE - N_BLIND
+        assert np.linalg.matrix_rank(weight[i]) == N_STATE - 2
         singular = np.linalg.svd(np.concatenate([weight[i], weight[j]], axis=1))[1]
         assert singular[-1] > 0.1 * singular[0]
+
+
+def test_modalities_may_each_show_a_part_of_their_own() -> None:
+    weight = Encoding.draw(3, n_blind=8, seed=0).weight
+    assert [np.linalg.matrix_rank(each) for each in weight] == [4, 4, 4]
+    for i, j in itertools.combinations(range(3), 2):
+        assert np.linalg.matrix_rank(np.concatenate([weight[i], weight[j]], axis=1)) == 8
+    assert np.linalg.matrix_rank(np.concatenate(list(weight), axis=1)) == N_STATE
 
 
 def test_encoding_belongs_to_the_task() -> None:

@@ -48,8 +48,6 @@ CLEARANCE = (4.0, 1.6)
 N_STATE = 12
 """Offset, drift, speed; three curvatures, three speeds to hold; the obstacle's distance, offset and drift."""
 
-N_BLIND = 2
-"""Directions of the state that a modality does not see, others for each."""
 CHANNELS = 16
 """Numbers in a frame."""
 GAIN = 1.2
@@ -73,7 +71,7 @@ N_RESET_DRAWS = len(BENDS) + 1 + 3 + 3
 
 
 class Encoding(NamedTuple):
-    """How the modalities show the state: all of it but ``N_BLIND`` directions each, through a random layer."""
+    """How the modalities show the state: all of it but some directions each, through a random layer."""
 
     weight: np.ndarray
     """(d, N_STATE, CHANNELS)."""
@@ -81,12 +79,12 @@ class Encoding(NamedTuple):
     """(d, CHANNELS)."""
 
     @classmethod
-    def draw(cls, n_modalities: int, seed: int) -> "Encoding":
+    def draw(cls, n_modalities: int, n_blind: int, seed: int) -> "Encoding":
         rng = np.random.default_rng(seed)
         directions = np.linalg.qr(rng.normal(size=(N_STATE, N_STATE))).Q.T
-        weight = rng.normal(size=(n_modalities, N_STATE, CHANNELS)) * GAIN / np.sqrt(N_STATE - N_BLIND)
+        weight = rng.normal(size=(n_modalities, N_STATE, CHANNELS)) * GAIN / np.sqrt(N_STATE - n_blind)
         for i in range(n_modalities):
-            blind = directions[N_BLIND * i : N_BLIND * (i + 1)]
+            blind = directions[np.arange(n_blind * i, n_blind * (i + 1)) % N_STATE]
             weight[i] -= blind.T @ (blind @ weight[i])
         return cls(weight, 0.3 * rng.normal(size=(n_modalities, CHANNELS)))
 
@@ -107,6 +105,9 @@ class DriveBatch:
     :param failure: (modality, kind): this modality is in this condition all the time, e.g. ``(0, "black")``; another
         one stays sound
     :param max_episode_steps: steps until an episode is cut
+    :param n_blind: directions of the 12-dimensional state that a modality does not see, 0 to 11; others for each as far
+        as there are enough. With 2 any two modalities of three show all of the state, with 8 each of three shows a part
+        of its own
     :param encoding_seed: of the random encoding, which is part of the task and not of the episode
     :raises ValueError: naming the option, if one is out of range
     """
@@ -118,13 +119,14 @@ class DriveBatch:
         corruption: float = 0.6,
         failure: tuple[int, str] | None = None,
         max_episode_steps: int = 200,
+        n_blind: int = 2,
         encoding_seed: int = 0,
     ):
-        _check_options(n_modalities, corruption, failure, max_episode_steps)
+        _check_options(n_modalities, corruption, failure, max_episode_steps, n_blind)
         self.num_envs, self.n_modalities = num_envs, n_modalities
         self.corruption, self.max_episode_steps = corruption, max_episode_steps
         self.failure = None if failure is None else (failure[0], CONDITIONS.index(failure[1]))
-        self.encoding = Encoding.draw(n_modalities, encoding_seed)
+        self.encoding = Encoding.draw(n_modalities, n_blind, encoding_seed)
         box = spaces.Box(-MAX_VALUE, MAX_VALUE, (2 * CHANNELS,), np.float32)
         self.observation_space = spaces.Dict({f"m{i}": box for i in range(n_modalities)})
         self.action_space = spaces.Box(-1, 1, (2,), np.float32)
@@ -305,7 +307,7 @@ class ReliabilityDriveEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
 
 
 def _check_options(
-    n_modalities: int, corruption: float, failure: tuple[int, str] | None, max_episode_steps: int
+    n_modalities: int, corruption: float, failure: tuple[int, str] | None, max_episode_steps: int, n_blind: int
 ) -> None:
     if not (isinstance(n_modalities, int) and 2 <= n_modalities <= 6):
         raise ValueError(f"n_modalities={n_modalities!r}: expected a whole number from 2 to 6.")
@@ -313,6 +315,8 @@ def _check_options(
         raise ValueError(f"corruption={corruption!r}: expected a probability in [0, 1].")
     if not (isinstance(max_episode_steps, int) and max_episode_steps >= 1):
         raise ValueError(f"max_episode_steps={max_episode_steps!r}: expected a whole number of steps, from 1 on.")
+    if not (isinstance(n_blind, int) and 0 <= n_blind < N_STATE):
+        raise ValueError(f"n_blind={n_blind!r}: expected a whole number of directions from 0 to {N_STATE - 1}.")
     if failure is None:
         return
     if not (isinstance(failure, (tuple, list)) and len(failure) == 2):
