@@ -2,10 +2,11 @@
 ReliabilityDrive-v0: a winding road seen through several vector sensors, any of which may fail at any time.
 
 A small task in which it matters whom to believe. The state of the drive is a vector of 12 numbers. Every modality shows
-it through a random layer of its own, all but two directions of it: one modality alone is not enough, any two are. They
-go black, freeze or turn to noise in segments of 25 steps on average; at least one is sound at any time, and nothing but
-the modality's own values tells which. The pay goes with the speed to hold, which changes along the road, so that the
-value of a state depends on what a sound modality shows, however well the car is driven.
+it through a random layer of its own, by default all but two directions of it: one modality alone is not enough, any two
+are. They go black, freeze or turn to noise in segments of 25 steps on average; at least one is sound at any time, and
+nothing but the modality's own values, and how much they have just changed, tells which. That is easy to tell: the task
+is not to detect failures, but to make use of them. The pay goes with the speed to hold, which changes along the road,
+so that the value of a state depends on what a sound modality shows, however well the car is driven.
 
 All environments of a batch are simulated at once (:class:`DriveBatch`), each with a random generator of its own, so
 that a batch equals as many single ones step for step; :class:`ReliabilityDriveEnv` is a batch of one.
