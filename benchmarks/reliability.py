@@ -114,7 +114,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--n-blind", type=int, default=2, help="directions of the state a modality does not see")
     parser.add_argument("--corruption", type=float, default=0.6, help="probability with which a modality fails")
-    parser.add_argument("--out", type=Path, help="folder; by default one for each task")
+    parser.add_argument("--out", type=Path, help="folder of runs on one task; by default one for each")
     parser.add_argument("--report", action="store_true", help="make no runs, write <out>/report.md")
     args = parser.parse_args(arguments)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("stopped"))  # as by Ctrl-C: the workers are to end too
