@@ -239,6 +239,8 @@ def test_failures_change_what_is_seen_and_not_what_happens() -> None:
         ({"corruption": 1.5}, "corruption=1.5"),
         ({"corruption": float("nan")}, "corruption=nan"),
         ({"max_episode_steps": 0}, "max_episode_steps=0"),
+        ({"n_blind": -1}, "n_blind=-1"),
+        ({"n_blind": 12}, "n_blind=12"),
         ({"failure": (3, "black")}, "modality from 0 to 2"),
         ({"failure": (0, "dark")}, "'black', 'frozen', 'noise'"),
         ({"failure": "black"}, "expected \\(modality, kind\\)"),
