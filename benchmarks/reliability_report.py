@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import pandas as pd
 
@@ -81,13 +81,3 @@ def _format(result: Interval, digits: int) -> str:
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """Lines of a Markdown table."""
     return ["| " + " | ".join(cells) + " |" for cells in [header, ["---"] * len(header), *rows]]
-
-
-def curves(rows: pd.DataFrame) -> Mapping[str, pd.DataFrame]:
-    """Learning curves: by method, a row per number of updates and a column per seed."""
-    points = rows[rows["measure"].str.fullmatch(r"return_\d+")]
-    points = points.assign(updates=points["measure"].str.removeprefix("return_").astype(int))
-    return {
-        str(method): group.pivot(index="updates", columns="seed", values="value")
-        for method, group in points.groupby("method", sort=False)
-    }
