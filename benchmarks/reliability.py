@@ -1,7 +1,7 @@
 """Who is believed when sensors fail: methods side by side on ReliabilityDrive-v0, from vectors, in minutes.
 
     python -m benchmarks.reliability                          # 8 seeds of six methods, on two cores
-    python -m benchmarks.reliability --methods have gve-wide --seeds 3 --updates 4000 --out /tmp/reliability
+    python -m benchmarks.reliability --methods have gve-wide --seeds 3 --updates 4000 --out runs/reliability
     python -m benchmarks.reliability --report                 # only the statistics of the runs that are there
     python -m benchmarks.reliability --n-blind 8 --corruption 0.3    # each modality shows a third of the state only
 
