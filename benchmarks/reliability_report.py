@@ -21,6 +21,7 @@ MEASURES = {
     "kept_frozen": "kept: frozen",
     "kept_noise": "kept: noise",
 }
+KEPT = ("kept_black", "kept_frozen", "kept_noise")
 
 
 def report(rows: pd.DataFrame) -> str:
@@ -48,6 +49,10 @@ def report(rows: pd.DataFrame) -> str:
             ["than", *SCORES.values()],
             [[method, *(_improvement(rows, method, m) for m in SCORES)] for method in others],
         )
+        if all(not values(rows, method, measure).empty for method in methods for measure in (*KEPT, "clean_return")):
+            lines += ["", f"## Return with one sensor failed: that of {REFERENCE} less the other's [95% interval]", ""]
+            table = [[method, *(_lead(rows, method, m) for m in KEPT)] for method in others]
+            lines += markdown(["than", *(MEASURES[m].removeprefix("kept: ") for m in KEPT)], table)
     lines += ["", "## What the weights and the values are worth: mean over seeds [95% interval]", ""]
     table = [[method, *(interval(values(rows, method, m), mean) for m in MEASURES)] for method in methods]
     return "\n".join([*lines, *markdown(["method", *MEASURES.values()], table), ""])
@@ -72,6 +77,17 @@ def _improvement(rows: pd.DataFrame, method: str, measure: str) -> str:
     if min(len(better), len(other)) < 2:
         return "-"
     return _format(stratified_bootstrap(probability_of_improvement, better, other), 2)
+
+
+def _lead(rows: pd.DataFrame, method: str, measure: str) -> str:
+    """By how much the returns under a failure of the reference are above those of a method, mean over seeds."""
+    ours, other = (
+        (values(rows, name, measure) * values(rows, name, "clean_return")).to_numpy()[:, None]
+        for name in (REFERENCE, method)
+    )
+    if min(len(ours), len(other)) < 2:
+        return "-"
+    return _format(stratified_bootstrap(lambda x, y: mean(x) - mean(y), ours, other), 1)
 
 
 def _format(result: Interval, digits: int) -> str:

@@ -232,6 +232,18 @@ def test_report_of_known_scores() -> None:
     assert "11.5 ± 1.1" in text and lines["method"]
 
 
+def test_lead_under_a_failure_is_in_returns_and_not_in_shares() -> None:
+    measures = {"final_return": 1.0, "area": 1.0, "kept_black": 0.5, "kept_frozen": 0.8, "kept_noise": 1.0}
+    rows = [
+        (method, seed, 10, measure, value)
+        for method, clean in (("have", 100.0), ("gve", 60.0))
+        for measure, value in {**measures, "clean_return": clean}.items()
+        for seed in range(2)
+    ]
+    text = report(pd.DataFrame(rows, columns=reliability.COLUMNS))
+    assert "| gve | 20.0 [20.0, 20.0] | 32.0 [32.0, 32.0] | 40.0 [40.0, 40.0] |" in text
+
+
 def test_small_runs_are_a_table(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reliability, "run", fake_run)
     table = reliability.run_small(seeds=(1, 0), n_updates=16, n_workers=1)
