@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.preprocessing import get_action_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, FlattenExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.sac.policies import Actor
 
 from benchmarks.measure import RESULTS
@@ -256,19 +257,28 @@ def evaluate(model: HAVESAC, samples: Samples) -> dict[str, float]:
             "local_error": max(errors) / std,
             "weight_auc": auc(weights.ravel(), samples.reliable[one_failed].ravel()),
         }
-    if model.critic.value_estimation == "have":
-        measures["negative_gradient"] = negative_gradient(model, samples, parts)
+    measures["negative_gradient"] = negative_gradient(model, samples.observations, samples.actions)
     return {name: float(value) for name, value in measures.items()}
 
 
-def negative_gradient(model: HAVESAC, samples: Samples, parts: Mapping[str, th.Tensor]) -> float:
-    """Share of samples (and twins) with dH/dq_g < 0 or dH/dq_l < 0."""
-    q_global, q_lve = (parts[name].detach().requires_grad_() for name in ("q_global", "q_lve"))
+def negative_gradient(model: HAVESAC, observations: PyTorchObs, actions: th.Tensor) -> float:
+    """
+    Share of samples (and twins) in which the value falls as the global or the weighted local value rises; NaN for a
+    model without re-fusion.
+
+    :param observations: raw, a batch
+    :param actions: (B, A), scaled to [-1, 1]
+    """
+    if not hasattr(model.critic, "refusion"):
+        return math.nan
     with th.no_grad():
-        features = model.policy.encode(samples.observations)
-    mixed = model.critic.refusion(q_global, q_lve, features)
-    gradients = th.autograd.grad(mixed.sum(), [q_global, q_lve])
-    return float((th.stack(gradients) < 0).any(dim=0).float().mean())
+        features = model.policy.encode(observations)
+        values = model.critic.values(features, actions)
+    assert values.q_global is not None and values.q_lve is not None
+    inputs = [values.q_global.requires_grad_(), values.q_lve.requires_grad_()]
+    mixed = model.critic.refusion(*inputs, features)
+    gradients = th.stack(th.autograd.grad(mixed.sum(), inputs))
+    return float((gradients < 0).any(dim=0).float().mean())
 
 
 def run(seed: int, n_updates: int = N_UPDATES, n_samples: int = N_SAMPLES, **kwargs: Any) -> Measures:

@@ -13,7 +13,7 @@ import torch as th
 from numpy.typing import NDArray
 
 from benchmarks import variants
-from benchmarks.known_q import Floats, auc
+from benchmarks.known_q import Floats, auc, negative_gradient
 from benchmarks.reliability_vec_env import ReliabilityDriveVecEnv
 from sb3_have import HAVESAC
 from sb3_have.envs.reliability_drive import CONDITIONS
@@ -77,6 +77,7 @@ N_EVALUATIONS = 8
 N_EPISODES = 24
 """Episodes of an evaluation, all at once, the same for every method and seed of training."""
 EVALUATION_SEED = 1_000_000
+N_GRADIENT_SAMPLES = 2000
 FAILURES = CONDITIONS[1:]
 
 
@@ -168,7 +169,8 @@ def run(method: str, seed: int, n_updates: int, task: Mapping[str, Any] | None =
     :return: measures by name, NaN where a method has no such part:
         ``return_<n>`` mean return after n updates, ``final_return`` the last of them and ``area`` their mean;
         ``weight_auc`` and ``weight_auc_in_step``, see :class:`Drive`;
-        ``value_bias`` and ``value_correlation``, see :func:`value_errors`; ``negative_gradient``, see there;
+        ``value_bias`` and ``value_correlation``, see :func:`value_errors`; ``negative_gradient``, see there, of
+        transitions from the replay buffer;
         ``clean_return`` with all modalities sound, and ``kept_black``, ``kept_frozen``, ``kept_noise``, the share of it
         that is left when one modality fails so for whole episodes, mean over the modalities;
         ``parameters`` of encoders and critics
@@ -187,7 +189,10 @@ def run(method: str, seed: int, n_updates: int, task: Mapping[str, Any] | None =
     measures["area"] = float(np.mean(list(measures.values())[:N_EVALUATIONS]))
     measures |= {"weight_auc": drive.weight_auc(), "weight_auc_in_step": drive.weight_auc_in_step()}
     bias, correlation = value_errors(model, **task)
-    measures |= {"value_bias": bias, "value_correlation": correlation, "negative_gradient": negative_gradient(model)}
+    measures |= {"value_bias": bias, "value_correlation": correlation}
+    assert model.replay_buffer is not None
+    batch = model.replay_buffer.sample(N_GRADIENT_SAMPLES)
+    measures["negative_gradient"] = negative_gradient(model, batch.observations, batch.actions)
     return {**measures, **kept_returns(model, **task), "parameters": sum(p.numel() for p in model.critic.parameters())}
 
 
@@ -272,24 +277,6 @@ def value_errors(
         returns[t] = rewards[t] + model.gamma * ~dones[t] * (bonus[t + 1] + returns[t + 1])
     q, returns = q[:n_steps][lived[:n_steps]], returns[:n_steps][lived[:n_steps]]
     return float((q - returns).mean() / returns.std()), float(np.corrcoef(q, returns)[0, 1])
-
-
-def negative_gradient(model: HAVESAC, n_samples: int = 2000) -> float:
-    """
-    Share of sampled transitions (and twins) in which the value falls as the global or the weighted local value rises.
-    """
-    if not hasattr(model.critic, "refusion"):
-        return float("nan")
-    assert model.replay_buffer is not None
-    batch = model.replay_buffer.sample(n_samples)
-    with th.no_grad():
-        features = model.policy.encode(batch.observations)
-        values = model.critic.values(features, batch.actions)
-    assert values.q_global is not None and values.q_lve is not None
-    inputs = [values.q_global.requires_grad_(), values.q_lve.requires_grad_()]
-    mixed = model.critic.refusion(*inputs, features)
-    gradients = th.stack(th.autograd.grad(mixed.sum(), inputs))
-    return float((gradients < 0).any(dim=0).float().mean())
 
 
 def _is_gve(model: HAVESAC) -> bool:

@@ -158,11 +158,11 @@ def test_kept_return_is_a_share_of_the_clean_one(monkeypatch: pytest.MonkeyPatch
     }
 
 
-@pytest.mark.parametrize("refusion,expected", [("convex", 0.0), ("monotone", 0.0), ("free", 0.5)])
-def test_negative_gradient(refusion: str, expected: float) -> None:
-    model = make_model("have", 0, refusion=refusion)
-    model.learn(50 * 8)
-    share = reliability_runs.negative_gradient(model, n_samples=300)
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("method,expected", [("have", 0.0), ("have-monotone", 0.0), ("free", 0.5)])
+def test_negative_gradient_of_a_run(monkeypatch: pytest.MonkeyPatch, method: str, expected: float) -> None:
+    monkeypatch.setattr(reliability_runs, "METHODS", {**METHODS, "free": {"refusion": "free"}})
+    share = reliability_runs.run(method, 0, 16)["negative_gradient"]
     assert share == 0.0 if expected == 0 else share > 0.1, share
 
 
