@@ -84,8 +84,9 @@ def _run(
 
 
 def load(folder: Path) -> pd.DataFrame:
-    """The rows of all runs in a folder."""
-    tables = [pd.read_csv(file) for file in sorted(folder.glob("*.csv"))]
+    """The rows of all runs in a folder; other tables may lie there too."""
+    files = [folder / f"{method}.csv" for method in (*METHODS, *VARIANTS)]
+    tables = [pd.read_csv(file) for file in files if file.exists()]
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=COLUMNS)
 
 
@@ -108,7 +109,9 @@ def missing(rows: pd.DataFrame, methods: Sequence[str], n_seeds: int, n_updates:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--methods", nargs="+", choices=[*METHODS, *VARIANTS], default=list(DEFAULT_METHODS))
+    parser.add_argument(
+        "--methods", nargs="+", choices=[*METHODS, *VARIANTS], default=list(DEFAULT_METHODS), help="in this order"
+    )
     parser.add_argument("--seeds", type=int, default=8, help="how many, from 0 on")
     parser.add_argument("--updates", type=int, default=N_UPDATES)
     parser.add_argument("--workers", type=int, default=2)
@@ -128,8 +131,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         told = {measure: value for _, _, _, measure, value in rows}
         print(f"{i}/{len(todo)} {rows[0][0]}-{rows[0][1]}: {_summary(told)}", flush=True)
     table = load(args.out)
-    chosen = table["updates"].eq(args.updates) & table["method"].isin(args.methods) & table["seed"].lt(args.seeds)
-    text = report(table[chosen])
+    chosen = table["updates"].eq(args.updates) & table["seed"].lt(args.seeds)
+    text = report(table[chosen], args.methods)
     print(text)
     if args.report:
         (args.out / "report.md").write_text(text)

@@ -24,13 +24,15 @@ MEASURES = {
 KEPT = ("kept_black", "kept_frozen", "kept_noise")
 
 
-def report(rows: pd.DataFrame) -> str:
+def report(rows: pd.DataFrame, methods: Sequence[str]) -> str:
     """
     :param rows: method, seed, updates, measure, value
+    :param methods: to tell of, in the order of the tables; those without rows are left out
     :return: tables of the scores (interquartile mean over seeds), of the probability that a run of "have" is better
         than one of another method, and of the other measures (mean over seeds), with 95% bootstrap intervals
     """
-    methods = list(dict.fromkeys(rows["method"]))
+    there = set(rows["method"])
+    methods = [method for method in dict.fromkeys(methods) if method in there]
     n_seeds = rows.groupby("method")["seed"].nunique()
     lines = ["## Scores: interquartile mean over seeds [95% interval], and mean ± standard deviation", ""]
     header = ["method", "seeds", *(f"{title} {kind}" for title in SCORES.values() for kind in ("IQM", "mean"))]

@@ -213,8 +213,11 @@ def test_runs_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     assert values(rows, "have", "weight_auc").empty
     assert not (tmp_path / "report.md").exists()
     monkeypatch.delattr(reliability, "run")
-    reliability.main([*arguments, "--report"])
-    assert "| gve |" in (tmp_path / "report.md").read_text()
+    (tmp_path / "other.csv").write_text("what,else\n1,2\n")  # no runs
+    for methods in (["have", "gve"], ["gve", "have"]):
+        reliability.main([*arguments, "--report", "--methods", *methods])
+        text = (tmp_path / "report.md").read_text()
+        assert (text.index("| have |") < text.index("| gve |")) == (methods[0] == "have")
 
 
 def test_report_of_known_scores() -> None:
@@ -224,12 +227,16 @@ def test_report_of_known_scores() -> None:
         for measure in ("final_return", "area")
         for seed in range(4)
     ]
-    text = report(pd.DataFrame(rows, columns=reliability.COLUMNS))
+    text = report(pd.DataFrame(rows, columns=reliability.COLUMNS), ["lve", "have", "gve", "deaf"])
     lines = {line.split(" | ")[0].removeprefix("| "): line for line in text.splitlines() if line.startswith("| ")}
     improvements = text.split("## Probability")[1]
     assert "| gve | 1.00 [1.00, 1.00] |" in improvements
     assert "| lve | 0.50 [" in improvements
     assert "11.5 ± 1.1" in text and lines["method"]
+    scores = text.split("\n## ")[0]
+    assert scores.index("| lve ") < scores.index("| have ") < scores.index("| gve "), "the order that was asked for"
+    assert improvements.index("| lve ") < improvements.index("| gve ")
+    assert "deaf" not in text, "it has no runs"
 
 
 def test_lead_under_a_failure_is_in_returns_and_not_in_shares() -> None:
@@ -240,7 +247,7 @@ def test_lead_under_a_failure_is_in_returns_and_not_in_shares() -> None:
         for measure, value in {**measures, "clean_return": clean}.items()
         for seed in range(2)
     ]
-    text = report(pd.DataFrame(rows, columns=reliability.COLUMNS))
+    text = report(pd.DataFrame(rows, columns=reliability.COLUMNS), ["have", "gve"])
     assert "| gve | 20.0 [20.0, 20.0] | 32.0 [32.0, 32.0] | 40.0 [40.0, 40.0] |" in text
 
 
