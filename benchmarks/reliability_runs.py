@@ -125,9 +125,15 @@ def make_model(method: str, seed: int, task: Mapping[str, Any] | None = None, **
     :param seed: of networks, environments and exploration
     :param task: options of the environment
     :param kwargs: of HAVESAC, in place of the method's own
+    :raises ValueError: for the paper's target with a form that it does not know
     """
     settings = {**HYPERPARAMETERS, **{**METHODS, **VARIANTS}[method], "policy_kwargs": policy_kwargs(WIDTH)}
     algorithm, policy = settings.pop("algorithm", HAVESAC), settings.pop("policy", "MultiInputPolicy")
+    if kwargs.get("target") == "paper" and policy in variants.BELLMAN_ONLY:
+        raise ValueError(
+            f'{method}: target="paper" mixes targets by a re-fusion network and takes the minimum over the twins after '
+            f'it, which {policy.__name__} does otherwise: train it with target="bellman".'
+        )
     if method.startswith("gve-wide"):
         settings["policy_kwargs"] = policy_kwargs(gve_width())
     env = ReliabilityDriveVecEnv(N_ENVS, n_modalities=N_MODALITIES, **(task or {}))

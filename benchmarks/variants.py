@@ -7,6 +7,9 @@
 Policies: :class:`MinBeforeMixing`, :class:`DetachedKeys`, :class:`DetachedAttention`, ``temperature(x)``,
 :class:`FlatAttention`, :class:`GlobalResidual`. Algorithm: :class:`CompetingWeights`. Modality dropout, supervision of
 the parts and the forms of re-fusion are options of HAVESAC itself.
+
+``BELLMAN_ONLY`` are the policies that mix otherwise than by the re-fusion network, or after the minimum. The paper's
+Eq. 10 (``target="paper"``) mixes by that network and takes the minimum after it, and so does not know them.
 """
 
 import math
@@ -151,6 +154,9 @@ class GlobalResidual(MultiModalPolicy):
     """Policy with :class:`GlobalResidualCritic`."""
 
     critic_class = GlobalResidualCritic
+
+
+BELLMAN_ONLY = (MinBeforeMixing, FlatAttention, GlobalResidual)
 
 
 class CompetingWeights(HAVESAC):
