@@ -287,6 +287,44 @@ def test_errors_name_the_remedy(kwargs: dict[str, Any], message: str) -> None:
         MultiModalEncoder(two_images(), 8, **kwargs)
 
 
+class Brighter(ImageEncoder):
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return super().forward(observations + 1)
+
+
+class BrighterByStages(Brighter):
+    @property
+    def stages(self) -> list[th.nn.Module]:
+        first, *others = super().stages
+        return [th.nn.Sequential(Shift(), first), *others]
+
+
+class Shift(th.nn.Module):
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return observations + 1
+
+
+class SubclassOfBrighter(Brighter):
+    """Its parent's ``forward`` is bypassed as well."""
+
+
+@pytest.mark.parametrize("encoder_class", [Brighter, SubclassOfBrighter])
+def test_encoder_whose_forward_would_be_bypassed(encoder_class: type[ImageEncoder]) -> None:
+    encoder_classes = {"event": encoder_class}
+    with pytest.raises(ValueError, match=rf"modality 'event': {encoder_class.__name__} has a `forward` of its own"):
+        MultiModalEncoder(two_images(), 8, encoder_classes=encoder_classes, fusion="efnet")
+    MultiModalEncoder(two_images(), 8, encoder_classes=encoder_classes)
+
+
+def test_encoder_with_stages_of_its_own() -> None:
+    space = two_images()
+    kwargs: Any = {"encoder_classes": dict.fromkeys(space, BrighterByStages), "precision": "float32"}
+    th.manual_seed(0)
+    plain, fused = MultiModalEncoder(space, 8, **kwargs), MultiModalEncoder(space, 8, fusion=Recording, **kwargs)
+    fused.load_state_dict(plain.state_dict())
+    assert th.equal(plain(sampled(space)), fused(sampled(space)))
+
+
 def test_vectors_cannot_be_fused() -> None:
     space = spaces.Dict({**two_images().spaces, "state": spaces.Box(-1, 1, (4,), np.float32)})
     with pytest.raises(ValueError, match=r"modality 'state': Transfuser fuses.*shape \(4,\).*`modalities`"):

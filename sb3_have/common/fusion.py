@@ -233,7 +233,8 @@ def make_fusions(
     :param shapes: (C, H, W) of each modality's images, or the shape of its vectors
     :param stages: after which stages: "last", "all", or their numbers from 0 on
     :param kwargs: of the fusion
-    :raises ValueError: if there is no such fusion or stage, or an encoder that has no stages; names it and the remedy
+    :raises ValueError: if there is no such fusion or stage, or an encoder that has no stages or replaces ``forward``
+        alone, which is not called here; names it and the remedy
     """
     if isinstance(fusion, str):
         if fusion not in FUSIONS:
@@ -245,6 +246,12 @@ def make_fusions(
                 f"modality {name!r}: {fusion.__name__} fuses the maps of images, and there are none between the stages "
                 f"of {type(encoder).__name__} on observations of shape {shapes[name]}; leave the modality out by "
                 '`modalities`, use ImageEncoder or one with `stages` and `features` like it, or take fusion="concat".'
+            )
+        if _replaces_forward_alone(type(encoder)):
+            raise ValueError(
+                f"modality {name!r}: {type(encoder).__name__} has a `forward` of its own, which {fusion.__name__} "
+                "would not call: it calls the encoder's `stages` one after the other, and then `features`. Override "
+                'one of these instead, or take fusion="concat".'
             )
     numbers = {name: len(encoder.stages) for name, encoder in encoders.items()}  # type: ignore[arg-type]
     if len(set(numbers.values())) != 1:
@@ -284,6 +291,15 @@ def encode_fused(encoders: Sequence[nn.Module], fusions: nn.ModuleDict, images: 
                     f"{[tuple(image.shape) for image in maps]} of {shapes}; let it keep them."
                 )
     return [encoder.features(image) for encoder, image in zip(encoders, maps, strict=True)]  # type: ignore[operator]
+
+
+def _replaces_forward_alone(encoder_class: type[nn.Module]) -> bool:
+    """Whether a subclass has a new ``forward`` beside ``stages`` and ``features`` that it inherits."""
+
+    def depth(name: str) -> int:  # 0 as well for what is no attribute of a class
+        return next((depth for depth, base in enumerate(encoder_class.__mro__) if name in vars(base)), 0)
+
+    return depth("forward") < min(depth("stages"), depth("features"))
 
 
 def _check_heads(channels: int, n_heads: int) -> None:
