@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import shutil
 from collections.abc import Sequence
 from functools import partial
@@ -97,7 +98,7 @@ def trained(job: Job, folder: Path, device: str) -> OffPolicyAlgorithm | None:
     model = run.train(grid.steps)
     if run.interrupted or model.num_timesteps < grid.steps:
         return None
-    if model.num_timesteps - grid.steps >= job.config.get("n_envs", 1):
+    if model.num_timesteps - grid.steps >= job.config.get("n_envs", 1) * _rollout(job.config):
         raise ValueError(
             f"{folder} has been trained to step {model.num_timesteps}, past the {grid.steps} at which it should be "
             "driven; choose another --runs"
@@ -107,6 +108,13 @@ def trained(job: Job, folder: Path, device: str) -> OffPolicyAlgorithm | None:
     told |= {"parameters": n_parameters(model), **machine(device)}
     write_atomically(record, partial(Path.write_text, data=json.dumps(told, indent=1)))
     return model
+
+
+def _rollout(config: dict[str, Any]) -> float:
+    """Steps of each environment from one update to the next: a stopped training goes on with whole rollouts."""
+    train_freq = config.get("train_freq", 1)
+    frequency, unit = (train_freq, "step") if isinstance(train_freq, int) else train_freq
+    return frequency if unit == "step" else math.inf
 
 
 def _reload(job: Job, folder: Path, record: dict[str, Any], device: str) -> OffPolicyAlgorithm:
