@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from sb3_have.common.drivers import KeepStraightDriver
-from sb3_have.common.plotting import modality_colours, plot_learning_curve, plot_modality_weights, write_gif
+from sb3_have.plotting import modality_colours, plot_learning_curve, plot_modality_weights, write_gif
 from sb3_have.common.recording import Recording, record_episode
 
 

@@ -5,40 +5,39 @@ They draw on ``Figure`` objects: a user's pyplot stays untouched. No text is sma
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patheffects import withStroke
 from matplotlib.ticker import EngFormatter
-from numpy.typing import ArrayLike
 
 from sb3_have.benchmark.reading import DISTANCE, Measure, Results, ordered
 from sb3_have.benchmark.tables import score_table
 from sb3_have.common.evaluation import performance_profile
-from sb3_have.common.plotting import modality_colours
+from sb3_have.plotting import weather as weather_figures
+from sb3_have.plotting.learning import whole_evaluations
+from sb3_have.plotting.style import (
+    MEDIUM,
+    SMALL,
+    Style,
+    draw_curve,
+    draw_levels,
+    draw_whiskers,
+    legend_above,
+    modality_colours,
+)
 
 WIDTH = 9.0
 """Of every figure [inch]."""
-SMALL, MEDIUM = 9, 10
 PER_PANEL = 7
 """Curves of a panel, the reference not counted: more cannot be told apart."""
 
 
 KEPT = (-1.0, 2.0)
 """Shares that a figure shows at most: that of a return near zero can be anything."""
-
-
-class Style(NamedTuple):
-    """How a method is drawn."""
-
-    colour: str
-    line: str = "-"
-    marker: str = "o"
-    hatch: str = ""
 
 
 # Okabe and Ito's colours, told apart by colour-blind people too; a method of the same family as another has its colour
@@ -113,45 +112,25 @@ def learning_curves(evaluations: pd.DataFrame, method: str) -> pd.DataFrame:
     :return: a row for each seed and step, ``seed``, ``step``, ``return_mean``, ``distance_mean``: means over weathers,
         of the steps that all of these seeds have in every weather
     """
-    own = evaluations[evaluations["method"] == method]
-    count = own.groupby(["seed", "step"])["weather"].transform("nunique")
-    own = own[count == evaluations["weather"].nunique()]
-    furthest = own.groupby("seed")["step"].transform("max") == own["step"].max()
-    own = own[furthest]
-    seeds = own.groupby("step")["seed"].transform("nunique")
-    own = own[seeds == own["seed"].nunique()]
+    own = whole_evaluations(evaluations[evaluations["method"] == method], evaluations["weather"].nunique())
     return pd.DataFrame(own.groupby(["seed", "step"], as_index=False)[["return_mean", "distance_mean"]].mean())
 
 
 def _draw_curve(axis: Axes, method: str, curves: pd.DataFrame, measure: Measure, emphasis: bool) -> None:
     by_step = curves.groupby("step")[f"{measure.name}_mean"]
     mean, lowest, highest = by_step.mean(), by_step.min(), by_step.max()
-    look, seeds = style(method), curves["seed"].nunique()
-    axis.plot(
-        mean.index,
-        mean,
-        color=look.colour,
-        linestyle=look.line,
-        marker=look.marker,
-        markersize=5,
-        linewidth=2.5 if emphasis else 1.5,
-        zorder=3 if emphasis else 2,
-        label=f"{method} ({seeds})",
-    )
-    if seeds > 1:
-        axis.fill_between(mean.index, lowest, highest, color=look.colour, alpha=0.13, linewidth=0)
+    seeds = curves["seed"].nunique()
+    band = (lowest, highest) if seeds > 1 else None
+    draw_curve(axis, mean.index, mean, band, style(method), f"{method} ({seeds})", emphasis)
 
 
 def _draw_drivers(axis: Axes, drivers: pd.DataFrame, measure: Measure) -> None:
     """Levels of the drivers that did not learn; those far above the curves in words, as they would flatten them."""
     means = drivers.groupby("driver", sort=False)[f"{measure.name}_mean"].mean()
     bottom, top = axis.get_ylim()
-    limit, above = bottom + 1.5 * (top - bottom), []
-    for (driver, level), line in zip(means.items(), ("--", ":", "-.") * len(means), strict=False):
-        if level > limit:
-            above.append(f"{driver} {level:.0f}")
-        else:
-            axis.axhline(float(level), color="0.35", linestyle=line, linewidth=1, label=str(driver), zorder=1)
+    limit = bottom + 1.5 * (top - bottom)
+    draw_levels(axis, {str(driver): float(level) for driver, level in means.items() if level <= limit})
+    above = [f"{driver} {level:.0f}" for driver, level in means.items() if level > limit]
     if above:
         axis.set_title(f"above: {', '.join(above)}", fontsize=SMALL, color="0.35")
 
@@ -239,52 +218,14 @@ def plot_profiles(results: Results, measure: Measure = DISTANCE, reference: str 
     return figure
 
 
-def weather_weights(weights: pd.DataFrame) -> pd.DataFrame:
-    """Mean weight of each modality over the episodes of a weather.
-
-    :param weights: as in ``weights.csv``
-    :return: a row for each method, weather and modality: ``mean``, ``lowest`` and ``highest`` of the ``seeds``
-    """
-    keys = ["method", "weather", "modality"]
-    of_seeds = weights.groupby([*keys, "seed"], sort=False)["weight"].mean()
-    grouped = of_seeds.groupby(level=keys, sort=False)
-    return grouped.agg(mean="mean", lowest="min", highest="max", seeds="count").reset_index()
-
-
 def plot_weather_weights(results: Results) -> Figure:
     """Mean weight of each modality by weather: a row for each method; whiskers from the lowest to the highest seed.
 
     :param results: with ``weights``
     """
-    table = weather_weights(results["weights"])
-    methods = ordered(set(table["method"]))
-    weathers = [weather for weather in results.weathers if weather in set(table["weather"])]
-    weathers = weathers or list(dict.fromkeys(table["weather"]))
-    colours = modality_colours(list(dict.fromkeys(table["modality"])))
-    figure = Figure(figsize=(WIDTH, 1.9 * len(methods) + 1.0), layout="constrained")
-    axes = figure.subplots(len(methods), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
-    width = 0.8 / len(colours)
-    for axis, method in zip(axes, methods, strict=True):
-        rows = table[table["method"] == method].set_index(["modality", "weather"])
-        for number, (modality, colour) in enumerate(colours.items()):
-            known = [weather for weather in weathers if (modality, weather) in rows.index]
-            if not known:
-                continue
-            places = [weathers.index(weather) + (number - (len(colours) - 1) / 2) * width for weather in known]
-            shown = rows.loc[[(modality, weather) for weather in known]]
-            axis.bar(places, shown["mean"], 0.92 * width, color=colour, label=modality)
-            if shown["seeds"].max() > 1:
-                _draw_whiskers(axis, places, shown["lowest"], shown["highest"])
-        seeds = sorted(set(results["weights"].loc[results["weights"]["method"] == method, "seed"]))
-        axis.set_title(f"{method}, {_seeds(seeds)}", fontsize=MEDIUM)
-        axis.axhline(1 / len(colours), color="0.35", linestyle=":", linewidth=1, label="equal weights")
-        axis.set(ylabel="weight", ylim=(0, 1), axisbelow=True)
-        axis.grid(axis="y", alpha=0.3)
-    axes[-1].set_xticks(range(len(weathers)), [_broken(weather) for weather in weathers], fontsize=SMALL)
-    handles, labels = axes[0].get_legend_handles_labels()
-    handles, labels = [*handles[1:], handles[0]], [*labels[1:], labels[0]]  # the line of equal weights last
-    _legend_above(figure, handles, labels)
-    return figure
+    weights = results["weights"]
+    weathers = [weather for weather in results.weathers if weather in set(weights["weather"])]
+    return weather_figures.plot_weather_weights(weights, weathers or None, ordered(set(weights["method"])))
 
 
 def plot_episode_weights(results: Results, method: str, seed: int) -> Figure:
@@ -323,7 +264,7 @@ def plot_episode_weights(results: Results, method: str, seed: int) -> Figure:
         axis.set_visible(False)
     figure.supxlabel("step of the episode", fontsize=MEDIUM)
     figure.supylabel("weight", fontsize=MEDIUM)
-    _legend_above(figure, *axes[0, 0].get_legend_handles_labels())
+    legend_above(figure, *axes[0, 0].get_legend_handles_labels())
     return figure
 
 
@@ -355,7 +296,7 @@ def plot_kept(table: pd.DataFrame, measure: Measure) -> Figure:
             handles[method] = bars
             if max(shares[case]["seeds"] for case in known) > 1:
                 lowest, highest = ([shares[case][name] for case in known] for name in ("lowest", "highest"))
-                _draw_whiskers(axis, places, lowest, highest)
+                draw_whiskers(axis, places, lowest, highest)
         labels = [f"{kind} {severity}" if len(set(rows["severity"])) > 1 else kind for kind, severity in cases]
         axis.set_xticks(range(len(cases)), labels)
         axis.set_title(f"{modality} fails", fontsize=MEDIUM)
@@ -365,7 +306,7 @@ def plot_kept(table: pd.DataFrame, measure: Measure) -> Figure:
     lowest, highest = axes[0].get_ylim()
     axes[0].set_ylim(max(lowest, KEPT[0]), min(highest, KEPT[1]))
     shown = [method for method in methods if method in handles]
-    _legend_above(figure, [handles[method] for method in shown], shown)
+    legend_above(figure, [handles[method] for method in shown], shown)
     return figure
 
 
@@ -375,24 +316,3 @@ def _shares(rows: pd.DataFrame, measure: Measure) -> Mapping[tuple[str, int], di
         (row["kind"], row["severity"]): {name: row[f"{measure.name}_{name}"] for name in names}
         for row in rows.to_dict("records")
     }
-
-
-def _legend_above(figure: Figure, handles: Sequence[Any], labels: Sequence[str]) -> None:
-    figure.legend(handles, labels, fontsize=SMALL, loc="outside upper center", ncols=8, frameon=False)
-
-
-def _draw_whiskers(axis: Axes, places: Sequence[float], lowest: ArrayLike, highest: ArrayLike) -> None:
-    outline = withStroke(linewidth=2.6, foreground="white")  # seen on a black bar too
-    axis.vlines(places, lowest, highest, color="0.3", linewidth=1.2, zorder=3, path_effects=[outline])
-
-
-def _seeds(seeds: Sequence[int]) -> str:
-    return f"seed {seeds[0]}" if len(seeds) == 1 else f"mean of seeds {', '.join(map(str, seeds))}"
-
-
-def _broken(weather: str) -> str:
-    """``HardRainNight`` on two lines."""
-    for end in ("Noon", "Night"):
-        if weather.endswith(end):
-            return f"{weather.removesuffix(end)}\n{end}"
-    return weather

@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 
 from sb3_have.benchmark import figures, tables
 from sb3_have.benchmark.reading import RETURN, Measure, Results, ResultsError, grid_of, ordered, read_results
+from sb3_have.plotting import weather_weights
 
 DPI = 110
 INTERVALS = (
@@ -177,7 +178,7 @@ class Report:
         weights = self.results["weights"]
         if weights.empty:
             return []
-        self._save_table("weights", figures.weather_weights(weights))
+        self._save_table("weights", weather_weights(weights))
         parts = ["## Weights of the modalities"]
         figure = figures.plot_weather_weights(self.results)
         parts.append(self._figure("weights_by_weather", figure, "Weight of each modality by weather"))

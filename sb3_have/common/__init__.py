@@ -1,1 +1,1 @@
-"""Parts that know nothing of HAVE: encoders, fusion, evaluation, plotting."""
+"""Parts that know nothing of HAVE: encoders, fusion, evaluation, recording."""

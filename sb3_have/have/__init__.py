@@ -1,6 +1,7 @@
 """Hierarchical Adaptive Value Estimation: the algorithm, its policy and its critic."""
 
 from sb3_have.have.auxiliary import AuxiliaryLoss, AuxiliaryLossCallback
+from sb3_have.have.callbacks import ModalityWeightsCallback
 from sb3_have.have.critic import AssignmentNetwork, GlobalCritic, LocalCritics, MultiModalCritic, RefusionNetwork
 from sb3_have.have.deepmdp import DeepMDP, DeepMDPCallback
 from sb3_have.have.have import HAVESAC
@@ -15,6 +16,7 @@ __all__ = [
     "DeepMDPCallback",
     "GlobalCritic",
     "LocalCritics",
+    "ModalityWeightsCallback",
     "MultiInputPolicy",
     "MultiModalCritic",
     "MultiModalPolicy",

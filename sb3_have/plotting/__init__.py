@@ -1,0 +1,39 @@
+"""Pictures of training runs and episodes.
+
+Each function takes data and gives a matplotlib ``Figure`` of its own: a user's pyplot stays untouched. Save one by
+``figure.savefig("name.png", dpi=120)``; a notebook shows it by itself.
+"""
+
+from sb3_have.plotting.animation import Frames, write_animation, write_gif
+from sb3_have.plotting.episode import plot_decomposition, plot_modality_weights
+from sb3_have.plotting.learning import (
+    Curves,
+    evaluation_curves,
+    monitor_curves,
+    plot_learning_curve,
+    plot_learning_curves,
+)
+from sb3_have.plotting.refusion import Response, plot_refusion, refusion_response
+from sb3_have.plotting.style import modality_colours, modality_styles
+from sb3_have.plotting.weather import plot_weather_weights, weather_weights, weights_table
+
+__all__ = [
+    "Curves",
+    "Frames",
+    "Response",
+    "evaluation_curves",
+    "modality_colours",
+    "modality_styles",
+    "monitor_curves",
+    "plot_decomposition",
+    "plot_learning_curve",
+    "plot_learning_curves",
+    "plot_modality_weights",
+    "plot_refusion",
+    "plot_weather_weights",
+    "refusion_response",
+    "weather_weights",
+    "weights_table",
+    "write_animation",
+    "write_gif",
+]
