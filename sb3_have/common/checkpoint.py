@@ -1,0 +1,355 @@
+"""Checkpoints from which a training goes on exactly, bit for bit on a CPU, as if it had never stopped."""
+
+from __future__ import annotations
+
+import inspect
+import io
+import os
+import random
+import re
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch as th
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.vec_env import VecEnv
+
+from sb3_have.common.archive import DamagedCheckpointError, check_archive, read_archive, read_info, write_archive
+from sb3_have.common.env_state import environments_state, restore_environments
+
+Callbacks = BaseCallback | Sequence[BaseCallback] | None
+
+PLAIN = (bool, int, float, complex, str, bytes, np.ndarray, np.generic, th.Tensor, type(None))
+PLAIN_RANDOM = (np.random.Generator, np.random.RandomState, random.Random)
+CONTAINERS = (list, tuple, set, frozenset, deque)
+
+
+def save_checkpoint(
+    model: OffPolicyAlgorithm,
+    path: str | os.PathLike[str],
+    callbacks: Callbacks = None,
+    info: Mapping[str, Any] | None = None,
+    rollout_started: bool = False,
+) -> None:
+    """Write all that the further training depends on into one file, which appears whole or not at all.
+
+    That is the model with every optimizer, the replay buffer, the environments in the middle of their episodes, with
+    the state of all wrappers (VecNormalize's statistics, stacked frames, Monitor), the random numbers of Python, NumPy
+    and PyTorch, and the callbacks' state. The logger's pending values are left out, and so are the environments of
+    callbacks that evaluate.
+
+    What an environment draws with, and Monitor's file, are made anew. An environment that cannot be pickled otherwise
+    (a simulator's connection, a MuJoCo renderer that has drawn) is named in a warning; when the training goes on, its
+    episodes begin anew, from its own random numbers, and the rest is exact. ``SubprocVecEnv`` needs
+    :class:`~sb3_have.common.env_state.ResumableEnv` around every environment.
+
+    The right moment is between two calls of ``learn``. In its midst a callback finds the training between two steps of
+    its own only at the start of a rollout, see :class:`ResumableCheckpointCallback`; not in ``_on_step``, when the last
+    transition is not stored yet.
+
+    :param model: any off-policy algorithm of Stable-Baselines3, with its environment
+    :param path: of the file; one that is there is replaced
+    :param callbacks: of which to keep every attribute that is plain data (numbers, text, arrays, random generators,
+        and containers of such) and no parameter of the constructor; those with ``get_state()`` and
+        ``set_state(state)`` choose themselves
+    :param info: further values, in JSON, for :func:`checkpoint_info`
+    :param rollout_started: whether it is called in a callback's ``_on_rollout_start``
+    :raises OSError: if the file cannot be written, as on a full disk; nothing is left of it then
+    """
+    env = model.get_env()
+    if env is None:
+        raise ValueError("the model has no environment, and a checkpoint holds the environment's state; use set_env")
+    environments = environments_state(env, (model.observation_space, model.action_space))
+    if environments.lost:
+        warnings.warn(
+            f"The state of the environment cannot be saved: {'; '.join(environments.lost)}. When the training goes on "
+            "from this checkpoint, its episodes begin anew; everything else is exact.",
+            stacklevel=2,
+        )
+    noise: dict[str, th.Tensor] = {}
+    # SB3 draws gSDE's noise before it calls `on_rollout_start`; a model that was just loaded has it still
+    if model.use_sde and (rollout_started or "reset_noise" in vars(model.actor)):
+        drawn = vars(model.actor.action_dist)
+        noise = {name: drawn[name].detach().cpu() for name in ("exploration_mat", "exploration_matrices")}
+    state = {
+        "algorithm": type(model),
+        "environments": environments,
+        "replay_buffer": model.replay_buffer,
+        "noise": noise,
+        "callbacks": [(type(each).__qualname__, _callback_state(each)) for each in _flattened(callbacks)],
+        "random": random_states(),  # last: whatever drew before is drawn
+    }
+    told = {"steps": model.num_timesteps, "algorithm": type(model).__name__, "info": dict(info or {})}
+    saved = io.BytesIO()
+    model.save(saved)
+    write_archive(Path(path), told, saved.getbuffer(), state)
+
+
+def load_checkpoint(
+    path: str | os.PathLike[str],
+    env: gym.Env[Any, Any] | VecEnv,
+    callbacks: Callbacks = None,
+    device: th.device | str = "auto",
+) -> Any:
+    """The model of a checkpoint, ready to go on::
+
+        callback = ResumableCheckpointCallback("checkpoints", save_freq=10_000)
+        HAVESAC("MultiInputPolicy", env, seed=0).learn(200_000, callback)
+        # the process dies; in a new one:
+        model = load_checkpoint("checkpoints", env, callback)
+        model.learn(200_000 - model.num_timesteps, callback, reset_num_timesteps=False)
+
+    With ``reset_num_timesteps=False`` SB3's ``learn`` resets neither counters nor, as the model has its last
+    observation, the environment; it counts ``total_timesteps`` from here, so schedules go on too. Call it at once:
+    random numbers that are drawn in between are missing later.
+
+    The file is unpickled, which can run any code, as SB3's replay buffers: load what you wrote yourself, and share
+    weights by :func:`~sb3_have.export_safetensors`.
+
+    :param path: of the file, or of a folder of ``checkpoint-<step>``, of which the newest whole one is taken
+    :param env: made as in the training that wrote it, wrappers and number of environments included; Monitor with
+        ``override_existing=False`` goes on with its file
+    :param callbacks: to put into the state that those of the same classes had, in their order
+    :param device: for the model
+    :return: the model
+    :raises DamagedCheckpointError: if the file is damaged
+    :raises FileNotFoundError: if there is none
+    :raises ValueError: if the environment is another, or the folder is of an older form
+    """
+    file = _file_of(Path(path))
+    _, saved, state = read_archive(file)
+    model = state["algorithm"].load(saved, env=env, device=device, force_reset=False)
+    model.observation_space, model.action_space = restore_environments(model.env, state["environments"])
+    model.replay_buffer = _fitted(state["replay_buffer"], model)
+    if state["environments"].lost:
+        model._last_obs = None  # so that `learn` resets the environments
+        if hasattr(model.replay_buffer, "truncate_last_trajectory"):
+            model.replay_buffer.truncate_last_trajectory()
+    if state["noise"]:
+        vars(model.actor.action_dist).update({name: noise.to(model.device) for name, noise in state["noise"].items()})
+        _skip_once(model.actor, "reset_noise")
+    if model.action_noise is not None:
+        _skip_once(model.action_noise, "reset")  # by which `learn` begins
+    _restore_callbacks(callbacks, state["callbacks"])
+    set_random_states(state["random"])
+    return model
+
+
+def _fitted(replay_buffer: ReplayBuffer, model: OffPolicyAlgorithm) -> ReplayBuffer:
+    """A loaded replay buffer for this device and, as HerReplayBuffer needs it, this environment."""
+    replay_buffer.device = model.device
+    if hasattr(replay_buffer, "set_env"):
+        replay_buffer.set_env(model.env)
+    return replay_buffer
+
+
+def _skip_once(owner: Any, method: str) -> None:
+    """Let the next call of a method do nothing: what it would draw or reset has been, before the checkpoint."""
+
+    def skip(*args: Any, **kwargs: Any) -> None:
+        delattr(owner, method)
+
+    setattr(owner, method, skip)
+
+
+def checkpoint_info(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """``steps``, ``algorithm`` and the ``info`` that a checkpoint was saved with; nothing is unpickled.
+
+    :raises DamagedCheckpointError: if the file is damaged
+    """
+    return read_info(Path(path))
+
+
+def checkpoint_step(path: Path) -> int:
+    """Training steps of a ``checkpoint-<step>``."""
+    return int(path.name.rpartition("-")[2])
+
+
+def checkpoints(folder: str | os.PathLike[str]) -> list[Path]:
+    """The files ``checkpoint-<step>`` of a folder, oldest first."""
+    files = [path for path in Path(folder).glob("checkpoint-*") if re.fullmatch(r"checkpoint-\d+", path.name)]
+    return sorted((path for path in files if path.is_file()), key=checkpoint_step)
+
+
+def newest_checkpoint(folder: str | os.PathLike[str]) -> Path | None:
+    """The checkpoint with the most steps that can be read, or None; a warning names those that are damaged."""
+    for path in reversed(checkpoints(folder)):
+        try:
+            check_archive(path)
+        except DamagedCheckpointError as error:
+            warnings.warn(f"{error}: the one before it is taken, if there is one.", stacklevel=2)
+        else:
+            return path
+    return None
+
+
+def _file_of(path: Path) -> Path:
+    if not path.is_dir():
+        return path
+    refuse_older_form(path)
+    newest = newest_checkpoint(path)
+    if newest is None:
+        raise FileNotFoundError(f"{path} has no checkpoint-<step> that can be read")
+    return newest
+
+
+def refuse_older_form(folder: Path) -> None:
+    """
+    :raises ValueError: if all that a folder has are checkpoints that are folders, as they were once
+    """
+    older = [path for path in [folder, *folder.glob("checkpoint-*")] if (path / "replay_buffer.pkl").exists()]
+    if older and not checkpoints(folder):
+        raise ValueError(
+            f"{older[0]} is a checkpoint of an older form, from which a training cannot go on exactly; begin anew in "
+            "another folder, or load its model.zip and replay_buffer.pkl as SB3 does"
+        )
+
+
+def write_checkpoint(folder: Path, model: OffPolicyAlgorithm, keep: int, **kwargs: Any) -> bool:
+    """Save ``checkpoint-<step>`` and remove the oldest of more than ``keep``.
+
+    :param kwargs: of :func:`save_checkpoint`
+    :return: whether it was saved; a warning tells why it was not, as on a full disk
+    """
+    path = folder / f"checkpoint-{model.num_timesteps}"
+    try:
+        save_checkpoint(model, path, **kwargs)
+    except OSError as error:
+        warnings.warn(f"{path} could not be written ({error}); the training goes on without it.", stacklevel=2)
+        return False
+    so_far = [each for each in checkpoints(folder) if checkpoint_step(each) <= model.num_timesteps]
+    for old in so_far[:-keep]:
+        old.unlink()
+    return True
+
+
+class ResumableCheckpointCallback(BaseCallback):
+    """
+    Saves checkpoints as a training goes, from which :func:`load_checkpoint` lets it go on exactly.
+
+    First in a list of callbacks, it lets no ``_on_rollout_start`` be run twice where the training goes on. The state of
+    all callbacks of the training is saved. A checkpoint that cannot be written is told by a warning.
+
+    :param folder: for ``checkpoint-<step>``
+    :param save_freq: steps from one to the next, in all environments together as ``num_timesteps``; there is a further
+        one at the end
+    :param keep: how many of the newest stay
+    :param verbose: 1 tells of every one
+    """
+
+    def __init__(self, folder: str | os.PathLike[str], save_freq: int, keep: int = 2, verbose: int = 0):
+        super().__init__(verbose)
+        if save_freq < 1 or keep < 1:
+            raise ValueError(f"save_freq={save_freq}, keep={keep}: expected whole numbers from 1 on.")
+        self.folder, self.save_freq, self.keep = Path(folder), save_freq, keep
+        self._last_step = 0
+
+    def _on_training_start(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        for remains in self.folder.glob("checkpoint-*.partial"):  # of a process that was killed while it wrote
+            remains.unlink()
+        self._last_step = self.model.num_timesteps
+
+    def _on_rollout_start(self) -> None:
+        # The only call of a callback with nothing pending: in `_on_step` the transition is still to be stored, and in
+        # `_on_rollout_end` its gradient steps are still to be made.
+        if self.model.num_timesteps // self.save_freq > self._last_step // self.save_freq:
+            self._save(rollout_started=True)
+        self._last_step = self.model.num_timesteps
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_training_end(self) -> None:
+        # where a callback ended the training, its last transition is in no replay buffer
+        if self.locals.get("new_obs") is self.model._last_obs:
+            self._save(rollout_started=False)
+
+    def _save(self, rollout_started: bool) -> None:
+        assert isinstance(self.model, OffPolicyAlgorithm)
+        saved = write_checkpoint(
+            self.folder, self.model, self.keep, callbacks=self.locals["callback"], rollout_started=rollout_started
+        )
+        if saved and self.verbose >= 1:
+            print(f"Saved checkpoint-{self.model.num_timesteps} in {self.folder}")
+
+
+def random_states() -> dict[str, Any]:
+    """States of the global random generators of Python, NumPy and PyTorch, CUDA's included."""
+    cuda = th.cuda.get_rng_state_all() if th.cuda.is_available() else []
+    return {"python": random.getstate(), "numpy": np.random.get_state(), "torch": th.get_rng_state(), "cuda": cuda}
+
+
+def set_random_states(states: Mapping[str, Any]) -> None:
+    """Put the global random generators into the states of :func:`random_states`."""
+    random.setstate(states["python"])
+    np.random.set_state(states["numpy"])
+    th.set_rng_state(states["torch"])
+    if th.cuda.is_available() and len(states["cuda"]) == th.cuda.device_count():
+        th.cuda.set_rng_state_all(states["cuda"])
+
+
+@contextmanager
+def same_random_numbers() -> Iterator[None]:
+    """Let what is done within draw no random numbers from those that come after."""
+    states = random_states()
+    try:
+        yield
+    finally:
+        set_random_states(states)
+
+
+def _flattened(callbacks: Callbacks) -> list[BaseCallback]:
+    """Callbacks and those within them, but for mere lists and the progress bar."""
+    waiting = [callbacks] if isinstance(callbacks, BaseCallback) else list(callbacks or ())
+    found: list[BaseCallback] = []
+    while waiting:
+        callback = waiting.pop(0)
+        if any(callback is each for each in found):
+            continue
+        found.append(callback)
+        for name, value in vars(callback).items():
+            children = value if isinstance(value, list | tuple) else [value]
+            if name != "parent":
+                waiting += [child for child in children if isinstance(child, BaseCallback)]
+    return [each for each in found if not isinstance(each, CallbackList | ProgressBarCallback)]
+
+
+def _callback_state(callback: BaseCallback) -> Any:
+    get_state: Callable[[], Any] | None = getattr(callback, "get_state", None)
+    if get_state is not None:
+        return get_state()
+    # what the constructor takes is the user's, who may give something else when the training goes on
+    constructors = [vars(each)["__init__"] for each in type(callback).__mro__ if "__init__" in vars(each)]
+    given = {name for each in constructors for name in inspect.signature(each).parameters} | {"locals", "globals"}
+    return {name: value for name, value in vars(callback).items() if name not in given and _is_plain(value)}
+
+
+def _is_plain(value: Any) -> bool:
+    if isinstance(value, Mapping):
+        return all(_is_plain(each) for pair in value.items() for each in pair)
+    if isinstance(value, CONTAINERS):
+        return all(map(_is_plain, value))
+    return isinstance(value, (*PLAIN, *PLAIN_RANDOM))
+
+
+def _restore_callbacks(callbacks: Callbacks, states: list[tuple[str, Any]]) -> None:
+    waiting = list(states)
+    for callback in _flattened(callbacks):
+        name = type(callback).__qualname__
+        index = next((index for index, (saved, _) in enumerate(waiting) if saved == name), None)
+        if index is None:
+            continue  # it was not there then
+        _, state = waiting.pop(index)
+        if hasattr(callback, "set_state"):
+            callback.set_state(state)
+        else:
+            vars(callback).update(state)

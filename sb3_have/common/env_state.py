@@ -1,0 +1,197 @@
+"""The complete state of environments, with all wrappers, in the middle of an episode."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.monitor import ResultsWriter
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
+
+from sb3_have.common.archive import dumps, loads
+
+NO_STATE = ("spec", "_cached_spec", "class_attributes", "remotes", "work_remotes", "processes")
+"""Attributes that tell how an environment was made, or lead to other processes."""
+
+DRAWING = ("pygame", "highway_env.envs.common.graphics")
+"""Modules whose windows and surfaces an environment makes anew when it draws."""
+
+RANDOM = (np.random.Generator, np.random.RandomState, random.Random, spaces.Space)
+
+
+class LayersState(NamedTuple):
+    """Of some environments and wrappers."""
+
+    names: list[str]
+    pickled: bytes
+    lost: list[str]  # what cannot be pickled; not empty: the rest is of no use but for what is random in it
+
+
+class EnvironmentsState(NamedTuple):
+    """Of a ``VecEnv`` and all that is in it."""
+
+    layers: LayersState
+    workers: list[Any]  # of environments in other processes
+
+    @property
+    def lost(self) -> list[str]:
+        """What could not be pickled, by class and attribute; if there is anything, the episodes begin anew."""
+        return [
+            *self.layers.lost,
+            *(name for state in self.workers if isinstance(state, LayersState) for name in state.lost),
+            *(OUT_OF_REACH for state in self.workers[:1] if not isinstance(state, LayersState)),
+        ]
+
+
+OUT_OF_REACH = "environments of SubprocVecEnv that are not wrapped in sb3_have.common.env_state.ResumableEnv"
+
+
+class ResumableEnv(gym.Wrapper[Any, Any, Any, Any]):
+    """
+    Lets a checkpoint have the state of an environment in a worker process of ``SubprocVecEnv``; it does nothing else,
+    and ``DummyVecEnv`` needs none of it. It is the outermost wrapper::
+
+        SubprocVecEnv([lambda: ResumableEnv(Monitor(gym.make("HighwayVision-v0")))] * 4)
+
+    and in the Zoo's configurations ``env_wrapper: sb3_have.common.env_state.ResumableEnv``.
+    """
+
+    def checkpoint_state(self) -> LayersState:
+        """State of the environment and of the process's own random numbers."""
+        return _capture(_gym_layers(self), (random.getstate(), np.random.get_state()))
+
+    def restore_checkpoint_state(self, state: LayersState) -> None:
+        """
+        :raises ValueError: if the state is of another environment
+        """
+        python, numpy = _restore(_gym_layers(self), state)
+        random.setstate(python)
+        np.random.set_state(numpy)
+
+
+def environments_state(vec_env: VecEnv, shared: Any = None) -> EnvironmentsState:
+    """All that decides what environments do next.
+
+    Every attribute of every wrapper and environment is pickled, together, so that what they share stays shared; but
+    for windows to draw in and Monitor's open file.
+
+    :param vec_env: with any wrappers
+    :param shared: further objects that may share parts with them
+    :return: can be pickled whatever the environments are; where their state cannot, it is named in ``lost`` and the
+        random generators are all there is
+    """
+    layers = _vec_layers(vec_env)
+    base, workers = layers[-1], []
+    if isinstance(base, DummyVecEnv):
+        layers = [*layers, *(layer for env in base.envs for layer in _gym_layers(env))]
+    elif isinstance(base, SubprocVecEnv):
+        resumable = all(base.env_is_wrapped(ResumableEnv))
+        workers = base.env_method("checkpoint_state") if resumable else base.get_attr("np_random")
+    state = _capture(layers, shared)
+    if not isinstance(base, DummyVecEnv | SubprocVecEnv):
+        state.lost.append(f"{type(base).__name__} (its environments are out of reach)")
+    return EnvironmentsState(state, workers)
+
+
+def restore_environments(vec_env: VecEnv, state: EnvironmentsState) -> Any:
+    """Put environments into a state.
+
+    :param vec_env: made like those that the state is of
+    :param state: of :func:`environments_state`
+    :return: what was ``shared``
+    :raises ValueError: if they have other wrappers, or are more or fewer
+    """
+    layers = _vec_layers(vec_env)
+    base = layers[-1]
+    if isinstance(base, DummyVecEnv):
+        layers = [*layers, *(layer for env in base.envs for layer in _gym_layers(env))]
+    shared = _restore(layers, state.layers)
+    if len(state.workers) not in (0, vec_env.num_envs):
+        raise ValueError(f"a checkpoint of {len(state.workers)} environments was given {vec_env.num_envs}")
+    for index, worker in enumerate(state.workers):
+        if isinstance(worker, LayersState):
+            base.env_method("restore_checkpoint_state", worker, indices=index)
+        else:
+            base.set_attr("np_random", worker, indices=index)
+    return shared
+
+
+def _vec_layers(vec_env: VecEnv) -> list[Any]:
+    """A ``VecEnv``, outermost wrapper first."""
+    layers = [vec_env]
+    while isinstance(layers[-1], VecEnvWrapper):
+        layers.append(layers[-1].venv)
+    return layers
+
+
+def _gym_layers(env: gym.Env[Any, Any]) -> list[Any]:
+    """An environment, outermost wrapper first."""
+    layers = [env]
+    while isinstance(layers[-1], gym.Wrapper):
+        layers.append(layers[-1].env)
+    return layers
+
+
+def _capture(layers: Sequence[Any], shared: Any) -> LayersState:
+    names, states = [type(layer).__qualname__ for layer in layers], [_attributes(layer) for layer in layers]
+    try:
+        return LayersState(names, dumps((states, shared), layers), [])
+    except Exception:  # whatever the environment's objects raise when they are asked for their state
+        lost = [
+            {name: reason for name, value in state.items() if (reason := _failure(value, layers))} for state in states
+        ]
+    # VecNormalize's statistics must not suffer from an environment that cannot be pickled
+    rest = [
+        {
+            name: value
+            for name, value in state.items()
+            if name not in failures and (isinstance(layer, VecEnv) or isinstance(value, RANDOM))
+        }
+        for layer, state, failures in zip(layers, states, lost, strict=True)
+    ]
+    told = [
+        f"{owner}.{name} ({reason})"
+        for owner, failures in zip(names, lost, strict=True)
+        for name, reason in failures.items()
+    ]
+    return LayersState(names, dumps((rest, shared), layers), told)
+
+
+def _attributes(layer: Any) -> dict[str, Any]:
+    """What belongs to the state of an environment or wrapper."""
+    return {
+        name: value
+        for name, value in vars(layer).items()
+        if name not in NO_STATE
+        and not isinstance(value, ResultsWriter)
+        and not type(value).__module__.startswith(DRAWING)
+    }
+
+
+def _failure(value: Any, layers: Sequence[Any]) -> str:
+    """Why an object cannot be pickled, empty if it can."""
+    try:
+        dumps(value, layers)
+    except Exception as error:
+        return f"{type(error).__name__}: {error}"
+    return ""
+
+
+def _restore(layers: Sequence[Any], state: LayersState) -> Any:
+    names = [type(layer).__qualname__ for layer in layers]
+    if names != state.names:
+        raise ValueError(
+            f"the checkpoint is of environments with other wrappers: {' > '.join(state.names)}, and it was given "
+            f"{' > '.join(names)}; make them as in the training that wrote it"
+        )
+    states, shared = loads(state.pickled, layers)
+    for layer, attributes in zip(layers, states, strict=True):
+        if not state.lost:  # what is computed once and kept (functools.cached_property) may be of the old state
+            for name in _attributes(layer).keys() - attributes.keys():
+                del vars(layer)[name]
+        vars(layer).update(attributes)
+    return shared
