@@ -53,7 +53,7 @@ class Frames:
         self.q: np.ndarray | None = None if q is None else q.min(axis=0)
         tiles = self._tiles(0)
         aspect = sum(picture.shape[1] / picture.shape[0] for picture in tiles.values())
-        self.tile = round(min((self.width - GAP * (len(tiles) - 1)) / aspect, 0.6 * self.width)) if tiles else 0
+        self.tile: int = round(min((self.width - GAP * (len(tiles) - 1)) / aspect, 0.6 * self.width)) if tiles else 0
         self._top = LINE + (self.tile + LINE if tiles else 0) + GAP  # of the bars
         height = self._top + LINE * len(self.styles) + (CHART + 2 * GAP if self.styles else 0)
         self.size = self.width, height + height % 2
@@ -87,7 +87,7 @@ class Frames:
 
     def _margin(self, step: int) -> int:
         """That centres the images."""
-        widths = [round(self.tile * tile.shape[1] / tile.shape[0]) for tile in self._tiles(step).values()]
+        widths: list[int] = [round(self.tile * tile.shape[1] / tile.shape[0]) for tile in self._tiles(step).values()]
         return max(0, (self.width - sum(widths) - GAP * (len(widths) - 1)) // 2)
 
     def _facts(self, step: int) -> str:
