@@ -1,0 +1,114 @@
+"""A benchmark with Ray for real: runs that are stopped and killed are all there at last, once."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from fake_drive import ENV_ID
+from tiny_grid import LocalPool, make_grid, read
+
+from sb3_have.benchmark import stages
+from sb3_have.benchmark.reading import read_results
+from sb3_have.benchmark.results import is_finished
+from sb3_have.benchmark.runner import FINISHED, STOPPED, Runner
+from sb3_have.benchmark.stages import FINAL_SEED, run_job
+from sb3_have.common.evaluation import evaluate_episodes
+from sb3_have.train import algorithms, checkpoint_step, newest_checkpoint
+
+
+def wait_until(happened: Callable[[], bool], process: subprocess.Popen[bytes], seconds: float = 240.0) -> None:
+    start = time.monotonic()
+    while not happened():
+        assert process.poll() is None, f"it ended by itself with code {process.returncode}"
+        assert time.monotonic() - start < seconds
+        time.sleep(0.05)
+
+
+def processes_of_session(session: int) -> list[int]:
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = stat.read_text().rpartition(")")[2].split()
+        except OSError:  # it has just ended
+            continue
+        if int(fields[3]) == session:
+            found.append(int(stat.parent.name))
+    return found
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the processes to kill in /proc")
+def test_benchmark_survives_sigterm_sigkill_and_a_dead_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With Ray for real: stopped in order, then one worker killed, then everything; at last it is all there, once."""
+    pytest.importorskip("ray")
+    config = {"env_wrapper": "slow_drive.SlowUntil"}
+    grid = make_grid(tmp_path, config, seeds=[0], steps=150, save_freq=10, eval_freq=100)
+    runs, results, hurry = tmp_path / "runs", tmp_path / "results", tmp_path / "hurry"
+    log = tmp_path / "log.txt"
+    command = [sys.executable, "-m", "sb3_have.benchmark", "run", "mine.yml", "--workers", "2"]
+    command += ["--runs", str(runs), "--results", str(results)]
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent), "HURRY": str(hurry)}
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start() -> subprocess.Popen[bytes]:
+        with log.open("w") as output:
+            kwargs: dict[str, Any] = {"stdout": output, "stderr": output, "start_new_session": True}
+            started.append(subprocess.Popen(command, cwd=tmp_path, env=environment, **kwargs))
+        return started[-1]
+
+    def steps(name: str) -> int:
+        checkpoint = newest_checkpoint(runs / name)
+        return 0 if checkpoint is None else checkpoint_step(checkpoint)
+
+    def pids_of_runs(session: int) -> list[int]:
+        return [
+            pid for pid in processes_of_session(session) if b"ray::_work" in Path(f"/proc/{pid}/cmdline").read_bytes()
+        ]
+
+    jobs = grid.jobs()
+    names = [job.name for job in jobs]
+    try:
+        process = start()
+        wait_until(lambda: all(stages.steps_done(runs / name) > 5 for name in names), process)
+        os.killpg(process.pid, signal.SIGTERM)  # Ray's own processes are hit too
+        assert process.wait(120) == STOPPED, log.read_text()
+        stopped = {name: steps(name) for name in names}
+        assert all(step > 5 for step in stopped.values())
+
+        process = start()
+        wait_until(lambda: all(steps(name) > stopped[name] for name in names), process)
+        os.kill(pids_of_runs(process.pid)[0], signal.SIGKILL)
+        wait_until(lambda: "goes on from its checkpoint, attempt 2 of 3" in log.read_text(), process)
+        known = {name: steps(name) for name in names}
+        wait_until(lambda: all(steps(name) > known[name] for name in names), process)
+        for pid in processes_of_session(process.pid):
+            os.kill(pid, signal.SIGKILL)
+        process.wait()
+    finally:
+        for process in started:
+            for pid in processes_of_session(process.pid):
+                os.kill(pid, signal.SIGKILL)
+    killed = {name: steps(name) for name in names}
+    assert all(known[name] < killed[name] < 150 for name in names)
+
+    hurry.touch()
+    monkeypatch.setenv("HURRY", str(hurry))
+    assert Runner(jobs, runs, results).run(LocalPool(lambda job: run_job(job, runs))) == FINISHED
+    assert all((runs / name / f"log-{killed[name]}").exists() for name in names)
+    read_results([results])
+    for job in jobs:
+        assert is_finished(results, job)
+        assert pd.read_csv(runs / job.name / "monitor.csv", skiprows=1)["l"].sum() <= 150, "no step is counted twice"
+        model = algorithms()[job.algo].load(runs / job.name / "model.zip")
+        rows = read(results, "episodes").query("method == @job.method and weather == 'slow'")
+        driven = evaluate_episodes(model, ENV_ID, ["slow"], 3, FINAL_SEED)
+        np.testing.assert_allclose(rows["return"], driven["return"], atol=1e-3, err_msg="it is the model that is kept")
+    curve = read(results, "evaluations")
+    assert not curve.duplicated(["method", "weather", "step"]).any()

@@ -1,0 +1,126 @@
+"""A run of a benchmark: every stage once, and taken up where it was."""
+
+import os
+import signal
+from pathlib import Path
+from typing import Any
+
+import pytest
+from fake_drive import ENV_ID
+from tiny_grid import FAILURES, TINY, make_grid, read
+
+from sb3_have import train
+from sb3_have.benchmark import stages
+from sb3_have.benchmark.grid import Job
+from sb3_have.benchmark.results import is_finished, merge
+from sb3_have.benchmark.stages import FINAL_SEED, collect, run_job
+from sb3_have.train import EVALUATION_SEED, Run, newest_checkpoint
+
+
+def test_evaluation_seeds_are_not_those_of_training() -> None:
+    assert FINAL_SEED != EVALUATION_SEED and min(FINAL_SEED, EVALUATION_SEED) > 100_000
+
+
+def test_stages_go_on_weather_by_weather(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = make_grid(tmp_path, failures=FAILURES).jobs()[1]
+    driven: list[tuple[str, Any]] = []
+    drive, watch = stages._drive, stages.weights_of_episode
+
+    def stop_at(number: int) -> None:
+        driven.append(("stop", number))
+        if len(driven) == number:
+            raise KeyboardInterrupt
+
+    def counted_drive(job: Job, model: Any, weather: str, n: int, failure: dict[str, Any] | None = None) -> Any:
+        stop_at(stop)
+        driven[-1] = (weather, None if failure is None else (failure["modality"], failure["kind"]))
+        return drive(job, model, weather, n, failure)
+
+    def counted_watch(job: Job, model: Any, task: Any) -> Any:
+        stop_at(stop)
+        driven[-1] = (task.weather, "weights")
+        return watch(job, model, task)
+
+    monkeypatch.setattr(stages, "_drive", counted_drive)
+    monkeypatch.setattr(stages, "weights_of_episode", counted_watch)
+    for stop in (2, 4, 8):  # noqa: B007 (the functions above read it)
+        with pytest.raises(KeyboardInterrupt):
+            run_job(job, tmp_path)
+        driven.pop()
+    stop = 99
+    assert run_job(job, tmp_path)
+    broken = [("depth", "black"), ("rgb", "black"), ("rgb", "overexposure")]
+    expected: list[tuple[str, Any]] = [(w, what) for what in (None, "weights") for w in ("slow", "fast")]
+    assert driven == expected + [(w, case) for w in ("slow", "fast") for case in broken]
+
+
+def test_failures_may_be_asked_for_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    runs, results = tmp_path / "runs", tmp_path / "results"
+    job = make_grid(tmp_path).jobs()[0]
+    assert run_job(job, runs)
+    merge(results, job, collect(job, runs / job.name))
+    assert is_finished(results, job) and not (results / "failures.csv").exists()
+
+    later = make_grid(tmp_path, failures=FAILURES).jobs()[0]
+    assert not is_finished(results, later)
+    monkeypatch.setattr(Run, "train", lambda *args: pytest.fail("it is trained"))
+    assert run_job(later, runs)
+    merge(results, later, collect(later, runs / job.name))
+    assert is_finished(results, later) and is_finished(results, job)
+    assert len(read(results, "failures")) == 8
+
+
+def test_run_begun_by_train_is_taken_up(tmp_path: Path) -> None:
+    job = make_grid(tmp_path, save_freq=0).jobs()[0]
+    config = {**TINY, "value_estimation": "gve", "n_timesteps": 7}
+    options: dict[str, Any] = {"eval_freq": 10, "eval_episodes": 1, "weathers": ("slow", "fast"), "save_freq": 0}
+    plain = Run(config, ENV_ID, tmp_path / job.name, seed=0, **options)
+    plain.train(12)
+    assert run_job(job, tmp_path)
+    minutes = float(collect(job, tmp_path / job.name)["runs"]["minutes"].iloc[0])
+    assert [path.name for path in (tmp_path / job.name).glob("log-*")] != []
+    assert sorted(path.name for path in (tmp_path / job.name).glob("log-*")) == ["log-0", "log-12"]
+    assert minutes >= round(plain.seconds / 60, 2)
+
+
+def test_checkpoint_stays_only_if_asked_for(tmp_path: Path) -> None:
+    short, long = make_grid(tmp_path).jobs()[0], make_grid(tmp_path, steps=40).jobs()[0]
+    folder = tmp_path / short.name
+    assert run_job(short, tmp_path, keep_checkpoint=True)
+    assert newest_checkpoint(folder) == folder / "checkpoint-30"
+    assert run_job(long, tmp_path)
+    assert newest_checkpoint(folder) is None
+    assert {path.name for path in folder.glob("log-*")} == {"log-0", "log-30"}
+    with pytest.raises(ValueError, match="gone on to step 40 from step 30"):
+        run_job(short, tmp_path)
+    with pytest.raises(ValueError, match="no checkpoint to go on from"):
+        run_job(make_grid(tmp_path, steps=50).jobs()[0], tmp_path)
+
+
+def test_training_past_the_grid_is_not_driven(tmp_path: Path) -> None:
+    job = make_grid(tmp_path).jobs()[0]
+    run = Run(job.config, ENV_ID, tmp_path / job.name, eval_freq=0)
+    run.train(31)
+    with pytest.raises(ValueError, match="trained to step 31, past the 30"):
+        run_job(job, tmp_path)
+    assert not (tmp_path / job.name / "final-30").exists()
+
+
+def test_stop_in_the_last_evaluation_is_a_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    job = make_grid(tmp_path, eval_freq=30).jobs()[0]
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "evaluate", lambda *args, **kwargs: os.kill(os.getpid(), signal.SIGINT))
+        assert not run_job(job, tmp_path)
+    assert newest_checkpoint(tmp_path / job.name) == tmp_path / job.name / "checkpoint-30"
+    assert run_job(job, tmp_path)
+
+
+def test_remains_of_a_checkpoint_are_in_nobodys_way(tmp_path: Path) -> None:
+    """As when a run was killed while it dropped one of two."""
+    job = make_grid(tmp_path).jobs()[0]
+    remains = tmp_path / job.name / "checkpoint.partial"
+    assert run_job(job, tmp_path, keep_checkpoint=True)
+    remains.mkdir()
+    (remains / "model.zip").touch()
+    assert run_job(job, tmp_path)
+    assert not [*(tmp_path / job.name).glob("checkpoint*")]
