@@ -1,0 +1,412 @@
+"""Weights as safetensors: a policy comes back bit by bit, and a folder that does not hold one says so."""
+
+import json
+import sys
+import warnings
+from collections import OrderedDict
+from collections.abc import Callable
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch as th
+from envs import TINY, RandomSensors, fill_buffer, sensors_space, tiny_model, vector, vectors_space
+from gymnasium import spaces
+from sb3_contrib import TQC
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+
+from sb3_have import MultiModalPolicy
+from sb3_have.common.crossq import MultiInputCrossQ
+from sb3_have.common.encoders import MultiModalExtractor, VectorEncoder
+from sb3_have.export import export_safetensors, load_policy, modality_weights, read_config
+
+
+class Normed(th.nn.Sequential):
+    """An encoder with running statistics."""
+
+    def __init__(self, space: spaces.Box, features_dim: int):
+        super().__init__(th.nn.Linear(space.shape[0], features_dim), th.nn.BatchNorm1d(features_dim))
+
+
+class OwnPolicy(MultiModalPolicy):
+    """A subclass whose constructor takes more than it tells SB3."""
+
+    def __init__(self, *args: Any, wide: int = 4, **kwargs: Any):
+        self.wide = wide
+        super().__init__(*args, **kwargs)
+        self.extra = th.nn.Linear(wide, wide)
+
+
+def trained(space: Any = None, **kwargs: Any) -> Any:
+    model = tiny_model(vectors_space() if space is None else space, learning_rate=1e-2, **kwargs)
+    fill_buffer(model, 40)
+    model.train(3, batch_size=8)
+    return model
+
+
+def loaded(path: Path, **kwargs: Any) -> MultiModalPolicy:
+    policy = load_policy(path, device="cpu", **kwargs)
+    assert isinstance(policy, MultiModalPolicy)
+    return policy
+
+
+def assert_same_policy(model: Any, policy: Any) -> None:
+    """Every tensor, the actions, and where they exist the weights and the parts of the value are the same bits."""
+    own, other = model.policy.state_dict(), policy.state_dict()
+    assert list(own) == list(other)
+    for name in own:
+        assert own[name].dtype == other[name].dtype and th.equal(own[name], other[name]), name
+    assert type(policy) is type(model.policy)
+    assert policy.observation_space == model.observation_space and policy.action_space == model.action_space
+    observation = model.observation_space.sample()
+    for deterministic in (True, False):
+        actions = []
+        for one in (model.policy, policy):
+            th.manual_seed(3)
+            if model.use_sde:
+                one.reset_noise()
+            actions.append(one.predict(observation, deterministic=deterministic)[0])
+        assert np.array_equal(*actions)
+    if isinstance(policy, MultiModalPolicy):
+        obs, _ = policy.obs_to_tensor(observation)
+        action = th.full((1, 2), 0.3)
+        parts, others = (one.critic.decompose(obs, action) for one in (model.policy, policy))
+        assert parts.keys() == others.keys() and all(th.equal(parts[name], others[name]) for name in parts)
+        if policy.critic.value_estimation != "gve":
+            weights, expected = modality_weights(policy, observation), model.modality_weights(observation)
+            assert list(weights) == list(expected)
+            assert all(np.array_equal(weights[name], expected[name]) for name in weights)
+
+
+VARIANTS: dict[str, dict[str, Any]] = {
+    "images": {"space": sensors_space()},
+    "single": {"space": vector(3)},
+    "groups": {
+        "refusion": "monotone",
+        "policy_kwargs": {
+            "modalities": {"second": ["b"], "first": ["a"]},
+            "encoder_kwargs": {"first": {"net_arch": (7, 5)}},
+            "attention_dim": 3,
+            "n_critics": 3,
+            "activation_fn": th.nn.Tanh,
+            "net_arch": {"pi": [8], "qf": [9]},
+            "optimizer_kwargs": {"betas": (0.5, 0.9)},
+        },
+    },
+    "gve-sde": {"value_estimation": "gve", "use_sde": True},
+    "lve-class": {"value_estimation": "lve", "policy_kwargs": {"encoder_classes": {"a": VectorEncoder}}},
+    "bounds": {
+        "space": spaces.Dict(
+            OrderedDict(
+                z=spaces.Box(-np.inf, np.inf, (2,)), a=spaces.Box(np.float32([-1.5, 0.1]), np.float32([np.inf, 9.0]))
+            )
+        )
+    },
+}
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_a_policy_comes_back_bit_by_bit(tmp_path: Path, name: str) -> None:
+    model = trained(**VARIANTS[name])
+    export_safetensors(model, tmp_path / "policy")
+    assert {file.name for file in (tmp_path / "policy").iterdir()} == {"config.json", "model.safetensors"}
+    policy = loaded(tmp_path / "policy")
+    assert_same_policy(model, policy)
+    before, after = (one._get_constructor_parameters() for one in (model.policy, policy))
+    assert before.keys() == after.keys()
+    assert list(policy.critic.encoder.modalities) == list(model.critic.encoder.modalities)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "space", "shared"),
+    [
+        (SAC, sensors_space(), True),
+        (TQC, vectors_space(), False),
+        (TQC, vectors_space(), True),
+        (MultiInputCrossQ, vectors_space(), False),
+    ],
+)
+def test_other_algorithms_on_these_encoders(tmp_path: Path, algorithm: Any, space: spaces.Dict, shared: bool) -> None:
+    policy_kwargs = {
+        "features_extractor_class": MultiModalExtractor,
+        "features_extractor_kwargs": {"features_dim": 8, "precision": "float32"},
+        "normalize_images": False,
+        "net_arch": [16],
+        "share_features_extractor": shared,
+    }
+    env = RandomSensors(space)
+    model = algorithm("MultiInputPolicy", env, buffer_size=50, learning_starts=8, policy_kwargs=policy_kwargs, seed=0)
+    model.learn(12)
+    export_safetensors(model, tmp_path)
+    policy: Any = load_policy(tmp_path, "cpu")
+    assert_same_policy(model, policy)
+    assert policy.share_features_extractor is shared
+
+
+def test_algorithms_of_other_policies_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"HAVESAC, SAC, TQC or MultiInputCrossQ, got PPO"):
+        export_safetensors(PPO("MlpPolicy", RandomSensors(vector(3)), device="cpu"), tmp_path)
+    space = spaces.Dict({"a": vector(2), "b": spaces.Discrete(3)})
+    with pytest.raises(ValueError, match=r"only Box spaces and Dicts of them are exported, got Discrete\(3\)"):
+        export_safetensors(SAC("MultiInputPolicy", RandomSensors(space), buffer_size=50), tmp_path)
+
+
+def test_a_loaded_policy_is_exported_again(tmp_path: Path) -> None:
+    model = trained()
+    export_safetensors(model, tmp_path / "first")
+    export_safetensors(loaded(tmp_path / "first"), tmp_path / "second")
+    assert_same_policy(model, loaded(tmp_path / "second"))
+
+
+def test_what_the_configuration_tells(tmp_path: Path) -> None:
+    env = VecFrameStack(DummyVecEnv([lambda: RandomSensors(sensors_space())]), 3)
+    export_safetensors(tiny_model(sensors_space(), env=env), tmp_path)
+    config = read_config(tmp_path)
+    assert config["algorithm"] == "HAVESAC" and config["n_stack"] == 3 and config["format_version"] == 1
+    assert {"sb3_have", "torch", "stable-baselines3", "gymnasium"} <= config["versions"].keys()
+    keys = dict(config["observation_space"]["spaces"])
+    assert keys["rgb"] == {"type": "Box", "shape": [9, 36, 36], "dtype": "uint8", "low": 0, "high": 255}
+
+
+def test_policies_of_vec_normalize_are_exported_with_a_warning(tmp_path: Path) -> None:
+    env = VecNormalize(DummyVecEnv([lambda: RandomSensors(vectors_space())]))
+    model = tiny_model(vectors_space(), env=env)
+    with pytest.warns(UserWarning, match="takes normalized observations") as caught:
+        export_safetensors(model, tmp_path)
+    assert caught[0].filename == __file__
+    env.norm_obs = False
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        export_safetensors(model, tmp_path)
+
+
+def test_classes_of_ones_own_are_given(tmp_path: Path) -> None:
+    kwargs: dict[str, Any] = {"encoder_classes": {"a": Normed, "b": VectorEncoder}, "activation_fn": th.nn.Hardtanh}
+    model = trained(policy_kwargs=kwargs)
+    export_safetensors(model, tmp_path)
+    with pytest.raises(ValueError, match=r"\['encoder_classes'\]\['a'\] is 'class Normed'|activation_fn") as error:
+        load_policy(tmp_path, "cpu")
+    assert "policy_kwargs={" in str(error.value) and str(tmp_path / "config.json") in str(error.value)
+    own = {"encoder_classes": {"a": Normed}, "activation_fn": th.nn.Hardtanh}
+    policy = loaded(tmp_path, policy_kwargs=own)
+    assert_same_policy(model, policy)
+    assert isinstance(policy.critic.encoder.encoders[1], VectorEncoder)
+    with pytest.raises(
+        ValueError, match=r"lacks 'critic\.encoder\.encoders\.0\.net.*also has 'critic\.encoder\.encoders\.0\.0"
+    ):
+        # another encoder than in training
+        load_policy(tmp_path, "cpu", policy_kwargs={**own, "encoder_classes": {"a": VectorEncoder}})
+
+
+def test_policies_of_ones_own_are_given(tmp_path: Path) -> None:
+    model = trained()
+    model.policy = OwnPolicy(
+        model.observation_space, model.action_space, lambda _: 0.0, **{**TINY, "net_arch": [16], "wide": 3}
+    )
+    export_safetensors(model, tmp_path)
+    with pytest.raises(
+        ValueError, match=r"policy_class is 'class OwnPolicy'.*load_policy\(path, policy_class=\.\.\.\)"
+    ):
+        load_policy(tmp_path, "cpu")
+    policy = load_policy(tmp_path, "cpu", OwnPolicy, {"wide": 3})
+    assert isinstance(policy, OwnPolicy) and policy.wide == 3
+    assert th.equal(policy.extra.weight, model.policy.extra.weight)
+    with pytest.raises(ValueError, match=r"'extra\.weight': expected float32 \(4, 4\), found float32 \(3, 3\)"):
+        load_policy(tmp_path, "cpu", OwnPolicy)
+    with pytest.raises(ValueError, match="policy_class is <class 'str'>"):
+        load_policy(tmp_path, "cpu", str)  # type: ignore[arg-type]
+
+
+def test_loading_leaves_random_numbers_and_training_alone(tmp_path: Path) -> None:
+    model = trained(use_sde=True)
+    export_safetensors(model, tmp_path)
+    th.manual_seed(0)
+    expected = th.rand(3)
+    th.manual_seed(0)
+    policy = loaded(tmp_path)
+    assert th.equal(th.rand(3), expected)
+    assert not policy.training and not policy.critic.encoder.training
+
+
+Damage = Callable[[dict[str, Any], dict[str, th.Tensor]], None]
+
+
+def set_in(*keys: str, value: Any) -> Damage:
+    def damage(config: dict[str, Any], tensors: dict[str, th.Tensor]) -> None:
+        for key in keys[:-1]:
+            config = config[key]
+        config[keys[-1]] = value
+
+    return damage
+
+
+def drop(name: str) -> Damage:
+    return lambda config, tensors: (tensors if name in tensors else config).pop(name)
+
+
+def put(name: str, tensor: th.Tensor) -> Damage:
+    return lambda config, tensors: tensors.update({name: tensor})
+
+
+BIAS = "actor.mu.bias"
+DAMAGES: dict[str, tuple[Damage, str]] = {
+    "missing tensor": (drop(BIAS), r"lacks 'actor\.mu\.bias'; .*export it again"),
+    "extra tensor": (put("actor.more", th.zeros(1)), r"also has 'actor\.more'"),
+    "wrong shape": (put(BIAS, th.zeros(3)), r"'actor\.mu\.bias': expected float32 \(2,\), found float32 \(3,\)"),
+    "wrong dtype": (put(BIAS, th.zeros(2).half()), r"'actor\.mu\.bias': expected float32 \(2,\), found float16 \(2,\)"),
+    "nan": (put(BIAS, th.tensor([0.0, np.nan])), r"'actor\.mu\.bias': expected finite .* found 1 of 2 .*diverged"),
+    "infinite": (put(BIAS, th.tensor([-np.inf, np.inf])), r"'actor\.mu\.bias'.* found 2 of 2 "),
+    "newer": (set_in("format_version", value=2), r"format_version 2, written by sb3_have 0\..*reads up to 1: upgrade"),
+    "no version": (drop("format_version"), r"'format_version' is None, expected int"),
+    "true version": (set_in("format_version", value=True), r"'format_version' is True, expected int"),
+    "no spaces": (drop("observation_space"), r"'observation_space' is None, expected dict"),
+    "kwargs": (set_in("policy_kwargs", value=[1]), r"'policy_kwargs' is \[1\], expected dict"),
+    "unknown argument": (set_in("policy_kwargs", "colour", value=1), r"MultiModalPolicy cannot be built.*'colour'"),
+    "wrong argument": (set_in("policy_kwargs", "features_dim", value="x"), r"MultiModalPolicy cannot be built"),
+    "wrong size": (
+        set_in("policy_kwargs", "features_dim", value=9),
+        r"expected float32 \(.*9.*\), found float32 \(.*8",
+    ),
+    "action shape": (set_in("action_space", "shape", value=[2, 3, "x"]), r"action_space is damaged"),
+    "action bounds": (set_in("action_space", "low", value=[1, 2, 3]), r"action_space is damaged"),
+    "action dtype": (set_in("action_space", "dtype", value="object"), r"action_space is damaged: .*'object'"),
+    "action type": (set_in("action_space", "type", value="Discrete"), r"action_space is damaged: type 'Discrete'"),
+    "keys": (set_in("observation_space", "spaces", value=[["a"]]), r"observation_space is damaged"),
+    "unknown mark": (set_in("policy_kwargs", "net_arch", value={"$file": "x"}), r"policy_kwargs\['net_arch'\] is 'x'"),
+}
+
+
+def rewrite(folder: Path, damage: Damage) -> None:
+    """Change what is in the two files, so that they still belong together."""
+    config = json.loads((folder / "config.json").read_text())
+    tensors = safetensors.torch.load_file(folder / "model.safetensors")
+    damage(config, tensors)
+    write_pair(folder, json.dumps(config).encode(), tensors)
+
+
+def write_pair(folder: Path, config: bytes, tensors: dict[str, th.Tensor]) -> None:
+    (folder / "config.json").write_bytes(config)
+    metadata = {"format": "pt", "config_sha256": sha256(config).hexdigest()}
+    safetensors.torch.save_file(tensors, folder / "model.safetensors", metadata)
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("export")
+    export_safetensors(tiny_model(vectors_space()), folder)
+    return folder
+
+
+@pytest.fixture
+def folder(exported: Path, tmp_path: Path) -> Path:
+    """A copy of an exported policy, to be damaged."""
+    for file in exported.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    return tmp_path
+
+
+def test_rewriting_alone_damages_nothing(folder: Path) -> None:
+    rewrite(folder, lambda config, tensors: None)
+    load_policy(folder, "cpu")
+
+
+@pytest.mark.parametrize("name", DAMAGES)
+def test_damaged_contents_are_refused_by_name(folder: Path, name: str) -> None:
+    damage, message = DAMAGES[name]
+    rewrite(folder, damage)
+    with pytest.raises(ValueError, match=message) as error:
+        load_policy(folder, "cpu")
+    file = "model.safetensors" if "tensor" in name or name in ("nan", "infinite") or "wrong " in name else "config.json"
+    file = "config.json" if name == "wrong argument" else file
+    assert str(error.value).startswith(str(folder / file))
+
+
+@pytest.mark.parametrize("length", [0, 7, 8, 100, 5000, -1])
+@pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
+def test_truncated_files_are_refused_by_name(folder: Path, name: str, length: int) -> None:
+    content = (folder / name).read_bytes()
+    # the last byte of the configuration is its line break
+    (folder / name).write_bytes(content[: length if length >= 0 else -2][: len(content) - 2])
+    if name == "config.json" and length == 5000:
+        return
+    with pytest.raises(ValueError, match=r"again") as error:
+        load_policy(folder, "cpu")
+    assert str(folder / name) in str(error.value)
+
+
+@pytest.mark.parametrize("content", [b"\xff\xfe", b"[1]", b'{"a": ', b"[" * 100_000, b'"x"'])
+def test_other_json_is_refused(folder: Path, content: bytes) -> None:
+    (folder / "config.json").write_bytes(content)
+    with pytest.raises(ValueError, match=r"config\.json: not the JSON of export_safetensors"):
+        load_policy(folder, "cpu")
+
+
+def test_missing_files_are_named(folder: Path) -> None:
+    with pytest.raises(FileNotFoundError, match=r"nowhere.config\.json: no such file"):
+        load_policy(folder / "nowhere", "cpu")
+    (folder / "model.safetensors").unlink()
+    with pytest.raises(FileNotFoundError, match=r"model\.safetensors: no such file"):
+        load_policy(folder, "cpu")
+
+
+def test_files_of_two_exports_are_not_mixed(folder: Path) -> None:
+    config = json.loads((folder / "config.json").read_text())
+    config["policy_kwargs"]["precision"] = "bfloat16"
+    (folder / "config.json").write_text(json.dumps(config))
+    with pytest.raises(ValueError, match=r"model\.safetensors: it was not written together with this config\.json"):
+        load_policy(folder, "cpu")
+
+
+def test_headers_beyond_the_limit_are_refused(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = folder / "model.safetensors"
+    file.write_bytes((100_000_001).to_bytes(8, "little") + b"{" + b" " * 100)
+    with pytest.raises(ValueError, match=r"model\.safetensors: 109 bytes .*too large"):
+        load_policy(folder, "cpu")
+    monkeypatch.setattr("sb3_have.export.safetensors.MAX_HEADER_SIZE", 100)
+    with pytest.raises(ValueError, match=r"config\.json: \d+ bytes, over the limit of 100"):
+        load_policy(folder, "cpu")
+    with pytest.raises(ValueError, match=r"\d+ bytes, over the limit of 100"):
+        export_safetensors(tiny_model(vectors_space()), folder)
+
+
+def test_a_failed_export_leaves_the_last_one(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = tiny_model(vectors_space(), seed=1)
+
+    def fill_the_disk(tensors: Any, path: Path, metadata: Any) -> None:
+        path.write_bytes(b"half a fi")
+        raise OSError(28, "No space left on device")
+
+    for writer in (fill_the_disk, lambda tensors, path, metadata: path.write_bytes(b"\xff" * 20)):
+        monkeypatch.setattr(safetensors.torch, "save_file", writer)
+        before = {file.name: file.read_bytes() for file in folder.iterdir() if file.suffix != ".partial"}
+        with pytest.raises((OSError, ValueError), match=r"No space left|not a whole safetensors file"):
+            export_safetensors(model, folder)
+        assert {name: (folder / name).read_bytes() for name in before} == before
+    load_policy(folder, "cpu")
+
+
+def test_what_cannot_be_exported(tmp_path: Path) -> None:
+    model = tiny_model(vectors_space())
+    for name in ("policy.safetensors", "policy.zip"):
+        with pytest.raises(ValueError, match="expected the name of a folder"):
+            export_safetensors(model, tmp_path / name)
+    (tmp_path / "file").touch()
+    with pytest.raises(ValueError, match="expected the name of a folder"):
+        export_safetensors(model, tmp_path / "file")
+    with th.no_grad():
+        model.actor.mu.bias[1] = th.nan
+    with pytest.raises(ValueError, match=r"MultiModalPolicy: tensor 'actor\.mu\.bias': expected finite.*found 1 of 2"):
+        export_safetensors(model, tmp_path / "policy")
+    assert not (tmp_path / "policy").exists()
+
+
+def test_without_the_extra(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = tiny_model(vectors_space())
+    monkeypatch.setitem(sys.modules, "safetensors", None)
+    for call in (lambda: load_policy(folder), lambda: export_safetensors(model, folder)):
+        with pytest.raises(ImportError, match=r'pip install "sb3_have\[export\]"'):
+            call()
