@@ -33,6 +33,11 @@ def config_path(name: str) -> Path:
     raise FileNotFoundError(f"no configuration {name!r}; looked for {', '.join(map(str, candidates))}")
 
 
+def config_names() -> list[str]:
+    """Names of the configurations in ``zoo_configs``, in order."""
+    return sorted(path.stem for path in config_path("havesac").parent.glob("*.yml"))
+
+
 def load_config(name: str, env_id: str) -> dict[str, Any]:
     """Hyper-parameters for an environment.
 
@@ -62,8 +67,8 @@ def model_kwargs(config: Mapping[str, Any]) -> dict[str, Any]:
           features_extractor_class: sb3_have.common.encoders.MultiModalExtractor
           activation_fn: torch.nn.Tanh
 
-    The Zoo does so for ``policy`` alone; in its own format the rest would be Python in a string, which it evaluates
-    without knowing this package.
+    The Zoo does so for ``policy`` alone; in its own format the rest is Python in a string, which it evaluates without
+    knowing this package. :mod:`sb3_have.zoo` translates.
 
     :raises ValueError: if a path leads nowhere
     """

@@ -63,7 +63,7 @@ def heads(method: str, modalities: tuple[str, ...] = ("rgb", "event"), **policy_
 def test_every_file_is_a_method() -> None:
     names = {path.stem for path in config_path("havesac").parent.glob("*.yml")}
     assert names == {*METHODS, "havesac"}
-    assert all(set(yaml.safe_load(config_path(name).read_text())) == {ENV_ID} for name in METHODS)
+    assert all(ENV_ID in yaml.safe_load(config_path(name).read_text()) for name in METHODS)
 
 
 def test_algorithm_follows_from_the_name() -> None:
