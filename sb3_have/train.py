@@ -3,9 +3,9 @@
     python -m sb3_have.train --config havesac --env HighwayVision-v0 --steps 200000 --seed 0 --out runs/have-0
 
 The same command resumes. The folder holds ``monitor.csv`` (training episodes), ``evaluation.csv`` (a row per weather
-at every evaluation), ``log-<first step>/progress.csv`` (SB3's log), ``checkpoint-<step>/`` (model, replay buffer, time
-spent) and ``model.zip``. A resumed run goes on learning from the same weights, optimizers and replay buffer in a new
-episode; it does not repeat, bit for bit, what an uninterrupted one would have done.
+at every evaluation), ``log-<first step>/progress.csv`` (SB3's log), the newest two ``checkpoint-<step>`` and
+``model.zip``. A resumed run goes on in the middle of its episodes; on a CPU it ends with the bits of an uninterrupted
+one (:mod:`sb3_have.common.checkpoint`).
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import io
 import json
-import shutil
 import signal
 import threading
 import time
@@ -35,7 +34,17 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 import sb3_have
 from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
+from sb3_have.common.checkpoint import (
+    checkpoint_info,
+    load_checkpoint,
+    refuse_older_form,
+    same_random_numbers,
+    write_checkpoint,
+)
+from sb3_have.common.checkpoint import checkpoint_step as checkpoint_step
+from sb3_have.common.checkpoint import newest_checkpoint as newest_checkpoint
 from sb3_have.common.crossq import MultiInputCrossQ
+from sb3_have.common.env_state import ResumableEnv
 from sb3_have.common.episodes import leave_interrupts_to_parent
 from sb3_have.common.evaluation import evaluate
 from sb3_have.common.files import locked, write_atomically
@@ -45,6 +54,9 @@ from sb3_have.envs.weather import WEATHERS
 
 EVALUATION_SEED = 1_000_000
 """Of the episodes that evaluate a run while it trains: the same for all runs."""
+
+KEPT_CHECKPOINTS = 2
+"""Of which the older one is for the case that the newest is damaged."""
 
 
 def algorithms() -> dict[str, type[OffPolicyAlgorithm]]:
@@ -76,14 +88,23 @@ def make_training_env(env_id: str, config: Mapping[str, Any], out: Path | None =
         told = env.reset()[1]
         keywords = tuple(key for key in ("distance", "weather", "end_reason") if key in told)
         if out is None:
-            return Monitor(env, info_keywords=keywords)
+            return ResumableEnv(Monitor(env, info_keywords=keywords))
         file = out / (f"{index}.monitor.csv" if n_envs > 1 else "monitor.csv")
-        return Monitor(env, str(file), info_keywords=keywords, override_existing=not file.exists())
+        return ResumableEnv(Monitor(env, str(file), info_keywords=keywords, override_existing=not file.exists()))
 
     n_envs, wrapper = config.get("n_envs", 1), env_wrapper(config)
     makers: list[Callable[[], gym.Env[Any, Any]]] = [partial(make, index) for index in range(n_envs)]
     vec_env: VecEnv = SubprocVecEnv(makers) if n_envs > 1 else DummyVecEnv(makers)
     return VecFrameStack(vec_env, config["frame_stack"]) if config.get("frame_stack", 1) > 1 else vec_env
+
+
+class TrainingStopped(Exception):
+    """Ends ``learn`` between two rollouts; a callback's False would lose the transition it has just made."""
+
+
+def is_due(frequency: int, step: int, last_step: int) -> bool:
+    """Whether a multiple of a frequency, 0 for never, lies between two steps; rollouts go several steps at a time."""
+    return frequency > 0 and step // frequency > last_step // frequency
 
 
 class RunCallback(BaseCallback):
@@ -100,9 +121,9 @@ class RunCallback(BaseCallback):
         self._handlers: dict[int, Any] = {}
 
     def _on_training_start(self) -> None:
-        self._started = time.monotonic()
-        self._earlier = self.run.seconds
-        # SB3 finishes the step it is in, then stops: the buffer and the optimizers stay whole
+        self._started, self._earlier = time.monotonic(), self.run.seconds
+        self._first_step = self._last_step = self.model.num_timesteps
+        # SB3 finishes the rollout it is in and the updates, so that buffer and optimizers stay whole
         if threading.current_thread() is threading.main_thread():
             for number in (signal.SIGINT, signal.SIGTERM):
                 self._handlers[number] = signal.signal(number, self._stop)
@@ -114,20 +135,35 @@ class RunCallback(BaseCallback):
         self.stopping = True
 
     def _on_step(self) -> bool:
-        run, step = self.run, self.num_timesteps
+        return True
+
+    def _on_rollout_start(self) -> None:
+        if self.model.num_timesteps == self._first_step:
+            return
+        self._evaluate_and_save(rollout_started=True)
+        limit = self.run.time_limit
+        if self.stopping or (limit is not None and time.monotonic() - self._started > limit):
+            self.locals["callback"].on_training_end()  # closes the progress bar
+            raise TrainingStopped
+
+    def _on_training_end(self) -> None:
+        self._evaluate_and_save(rollout_started=False)
+
+    def _evaluate_and_save(self, rollout_started: bool) -> None:
+        """Between rollouts, where nothing is pending: a run that goes on from here misses nothing."""
+        run, step = self.run, self.model.num_timesteps
         run.seconds = self._earlier + time.monotonic() - self._started
-        # one that a stop keeps from being made is made up for when the run goes on
-        if run.is_due(run.eval_freq, step) and not self.stopping:
+        # an evaluation that a stop prevents is made up for when the run goes on
+        if not self.stopping:
             self._in_evaluation = True
             try:
-                run.evaluate(self.model, step)
+                run.evaluate_if_due(self.model)
             except KeyboardInterrupt:
                 self.stopping = True
             self._in_evaluation = False
-        if run.is_due(run.save_freq, step):
-            run.save(self.model)
-        out_of_time = run.time_limit is not None and time.monotonic() - self._started > run.time_limit
-        return not (self.stopping or out_of_time)
+        if is_due(run.save_freq, step, self._last_step):
+            run.save(self.model, rollout_started)
+        self._last_step = step
 
     def restore_handlers(self) -> None:
         """Give the signals back to whoever had them."""
@@ -177,6 +213,7 @@ class Run:
         self.device = device
         self.seconds = 0.0  # spent training and evaluating, over all sessions
         self.interrupted = False
+        self._rollout_started = self._in_mid_rollout = False
 
     def train(self, steps: int, progress_bar: bool = False, keep_checkpoint: bool = True) -> OffPolicyAlgorithm:
         """Train up to a number of steps, from the newest checkpoint if there is one.
@@ -193,6 +230,7 @@ class Run:
             return self._train(steps, progress_bar, keep_checkpoint)
 
     def _train(self, steps: int, progress_bar: bool, keep_checkpoint: bool) -> OffPolicyAlgorithm:
+        refuse_older_form(self.out)
         checkpoint = newest_checkpoint(self.out)
         if checkpoint is None and (self.out / "model.zip").exists():
             raise ValueError(
@@ -206,14 +244,15 @@ class Run:
         env = make_training_env(self.env_id, self.config, self.out)
         try:
             model = self._make_model(checkpoint, env)
-            if done and self.is_due(self.eval_freq, done) and done not in self._evaluated():
-                self.evaluate(model, done)
+            self.evaluate_if_due(model)
             if done < steps:
                 self._learn(model, steps - done, progress_bar)
+            if self._in_mid_rollout:
+                return model  # what is on disk is whole
+            if keep_checkpoint and model.num_timesteps > done:
+                self.save(model, self._rollout_started)
         finally:
             env.close()
-        if keep_checkpoint and model.num_timesteps > done:
-            self.save(model)
         write_atomically(self.out / "model.zip", model.save)
         return model
 
@@ -223,43 +262,33 @@ class Run:
         model.set_logger(logger)
         try:
             model.learn(steps, callback=callback, reset_num_timesteps=done == 0, progress_bar=progress_bar)
+        except TrainingStopped:
+            self._rollout_started = True
         except KeyboardInterrupt:  # the second one: the first ends the training by itself
-            callback.stopping = True
+            self._in_mid_rollout = True
         finally:
             callback.restore_handlers()
             logger.close()
-        self.interrupted = callback.stopping
+        self.interrupted = callback.stopping or self._in_mid_rollout
 
     def _check_same_run(self, checkpoint: Path) -> None:
-        state = json.loads((checkpoint / "state.json").read_text())
+        state = checkpoint_info(checkpoint)["info"]
         now = self._settings()
         if state["settings"] != now:
             raise ValueError(f"{checkpoint} is of a run with {state['settings']}, not {now}; choose another folder")
         self.seconds = state["seconds"]
 
     def _make_model(self, checkpoint: Path | None, env: VecEnv) -> OffPolicyAlgorithm:
-        algorithm = algorithms()[self.algo]
-        if checkpoint is None:
-            kwargs = model_kwargs(self.config)
-            if self.algo != "havesac" and "replay_buffer_class" not in kwargs:  # as HAVESAC has by default
-                derived = {"n_stack": stacked_frames(env), "n_steps": kwargs.pop("n_steps", 1)}
-                derived |= {"gamma": kwargs.get("gamma", 0.99)}
-                kwargs["replay_buffer_class"] = ModalityReplayBuffer
-                kwargs["replay_buffer_kwargs"] = derived | kwargs.get("replay_buffer_kwargs", {})
-            return algorithm(env=env, seed=self.seed, device=self.device, **kwargs)
-        model = algorithm.load(checkpoint / "model.zip", env=env, device=self.device)
-        model.load_replay_buffer(checkpoint / "replay_buffer.pkl")
-        # other episodes and noise than those at the start of the run
-        model.set_random_seed(self.seed + model.num_timesteps)
-        return model
-
-    def is_due(self, frequency: int, step: int) -> bool:
-        """Whether a step is the first at or past a multiple of a frequency: n environments go n steps at a time."""
-        return frequency > 0 and step // frequency > (step - self.config.get("n_envs", 1)) // frequency
-
-    def _evaluated(self) -> set[int]:
-        path = self.out / "evaluation.csv"
-        return set(pd.read_csv(path)["step"]) if path.exists() else set()
+        if checkpoint is not None:
+            resumed: OffPolicyAlgorithm = load_checkpoint(checkpoint, env, device=self.device)
+            return resumed
+        kwargs = model_kwargs(self.config)
+        if self.algo != "havesac" and "replay_buffer_class" not in kwargs:  # as HAVESAC has by default
+            derived = {"n_stack": stacked_frames(env), "n_steps": kwargs.pop("n_steps", 1)}
+            derived |= {"gamma": kwargs.get("gamma", 0.99)}
+            kwargs["replay_buffer_class"] = ModalityReplayBuffer
+            kwargs["replay_buffer_kwargs"] = derived | kwargs.get("replay_buffer_kwargs", {})
+        return algorithms()[self.algo](env=env, seed=self.seed, device=self.device, **kwargs)
 
     def _settings(self) -> dict[str, Any]:
         config = {key: value for key, value in self.config.items() if key != "n_timesteps"}
@@ -283,22 +312,22 @@ class Run:
             kept = int((rows["l"].cumsum() <= step / self.config.get("n_envs", 1)).sum())
             write_atomically(path, partial(Path.write_text, data="".join([head, *lines[: kept + 1]])))
 
-    def save(self, model: Any) -> None:
-        """Write ``checkpoint-<step>``: it appears complete or not at all, and then older ones go."""
-        target = self.out / f"checkpoint-{model.num_timesteps}"
-        if target.exists():
-            return
-        partial = self.out / "checkpoint.partial"
-        shutil.rmtree(partial, ignore_errors=True)
-        partial.mkdir()
-        model.save(partial / "model.zip")
-        model.save_replay_buffer(partial / "replay_buffer.pkl")
-        state = {"seconds": self.seconds, "settings": self._settings()}
-        (partial / "state.json").write_text(json.dumps(state, indent=1))
-        partial.rename(target)
-        for older in self.out.glob("checkpoint-*"):
-            if older != target:
-                shutil.rmtree(older)
+    def save(self, model: Any, rollout_started: bool = False) -> None:
+        """Write ``checkpoint-<step>``, unless it is there; see :func:`~sb3_have.common.checkpoint.save_checkpoint`."""
+        if not (self.out / f"checkpoint-{model.num_timesteps}").exists():
+            info = {"seconds": self.seconds, "settings": self._settings()}
+            write_checkpoint(self.out, model, KEPT_CHECKPOINTS, info=info, rollout_started=rollout_started)
+
+    def evaluate_if_due(self, model: Any) -> None:
+        """Evaluate, if there is no evaluation since the last multiple of ``eval_freq``; the training does not notice.
+
+        :param model: between two rollouts
+        """
+        path = self.out / "evaluation.csv"
+        last_step = int(pd.read_csv(path)["step"].max()) if path.exists() else 0
+        if is_due(self.eval_freq, model.num_timesteps, last_step):
+            with same_random_numbers():
+                self.evaluate(model, model.num_timesteps)
 
     def evaluate(self, model: Any, step: int) -> None:
         """Append a row per weather to ``evaluation.csv`` and print their mean."""
@@ -324,16 +353,6 @@ class Run:
             f"over {len(frame)} weathers, {self.seconds / 60:.1f} min",
             flush=True,
         )
-
-
-def checkpoint_step(checkpoint: Path) -> int:
-    """Training steps of a checkpoint."""
-    return int(checkpoint.name.rpartition("-")[2])
-
-
-def newest_checkpoint(out: Path) -> Path | None:
-    """The complete checkpoint with the most steps, if any."""
-    return max(out.glob("checkpoint-*"), key=checkpoint_step, default=None)
 
 
 def main(arguments: list[str] | None = None) -> None:

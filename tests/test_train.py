@@ -38,7 +38,7 @@ def test_resumed_run_goes_on(tmp_path: Path) -> None:
     assert list(frame["step"]) == [10, 10, 20, 20, 30, 30, 40, 40]
     assert list(frame["weather"]) == ["slow", "fast"] * 4
     assert frame["wall_time"].is_monotonic_increasing
-    assert [path.name for path in tmp_path.glob("checkpoint*")] == ["checkpoint-40"]
+    assert {path.name for path in tmp_path.glob("checkpoint*")} == {"checkpoint-25", "checkpoint-40"}
     assert second_run.seconds > 0
 
 
@@ -65,8 +65,10 @@ def test_folder_of_another_run_is_refused(tmp_path: Path) -> None:
 
 
 def test_incomplete_checkpoint_is_ignored(tmp_path: Path) -> None:
-    (tmp_path / "checkpoint.partial").mkdir()
+    (tmp_path / "checkpoint-30.partial").touch()
     assert newest_checkpoint(tmp_path) is None
+    make_run(tmp_path, eval_freq=0).train(8)
+    assert [path.name for path in tmp_path.glob("checkpoint*")] == ["checkpoint-8"]
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
@@ -139,12 +141,19 @@ def test_model_without_checkpoint_is_not_trained_over(tmp_path: Path) -> None:
     assert len(pd.read_csv(tmp_path / "evaluation.csv")) == 2
 
 
-def test_remains_of_older_checkpoints_go(tmp_path: Path) -> None:
-    """As when a run was killed while it removed one."""
-    make_run(tmp_path, eval_freq=0).train(8)
-    (tmp_path / "checkpoint-3").mkdir()
-    make_run(tmp_path, eval_freq=0).train(12)
-    assert [path.name for path in tmp_path.glob("checkpoint*")] == ["checkpoint-12"]
+def test_two_checkpoints_stay(tmp_path: Path) -> None:
+    make_run(tmp_path, eval_freq=0, save_freq=5).train(22)
+    assert {path.name for path in tmp_path.glob("checkpoint*")} == {"checkpoint-20", "checkpoint-22"}
+
+
+def test_checkpoint_of_older_form_is_refused(tmp_path: Path) -> None:
+    older = tmp_path / "checkpoint-8"
+    older.mkdir()
+    for name in ("model.zip", "replay_buffer.pkl", "state.json"):
+        (older / name).touch()
+    with pytest.raises(ValueError, match=r"checkpoint-8 is a checkpoint of an older form"):
+        make_run(tmp_path).train(12)
+    assert not (tmp_path / "model.zip").exists()
 
 
 def test_time_limit(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 All of it goes into the run's folder, step by step and each step whole, so that a run which dies goes on where it was:
 
-    monitor.csv, evaluation.csv, checkpoint-<step>/, model.zip    of :class:`sb3_have.train.Run`
+    monitor.csv, evaluation.csv, checkpoint-<step>, model.zip    of :class:`sb3_have.train.Run`
     final-<steps>/training.json                                   the training is over; what it took
     final-<steps>/episodes.csv, weights.csv, failures.csv         a weather at a time
 """
@@ -27,13 +27,14 @@ from sb3_have import HAVESAC
 from sb3_have.benchmark.grid import Failures, Job
 from sb3_have.benchmark.reading import FILES
 from sb3_have.benchmark.results import difference, read_text_table, settings_column
+from sb3_have.common.checkpoint import checkpoint_step, checkpoints
 from sb3_have.common.episodes import EpisodeQueue, Task, match_observations
 from sb3_have.common.evaluation import evaluate_episodes, summarize
 from sb3_have.common.files import locked, write_atomically
 from sb3_have.common.machine import machine
 from sb3_have.configuration import Env, env_wrapper, evaluation_env_kwargs
 from sb3_have.sensors import SENSORS, SensorFailure, failures_for
-from sb3_have.train import Run, algorithms, checkpoint_step, newest_checkpoint
+from sb3_have.train import Run, algorithms
 
 FINAL_SEED = 2_000_000
 """Of the episodes after training: the same for all methods and seeds, and none that a run was trained or chosen by
@@ -130,11 +131,11 @@ def _reload(job: Job, folder: Path, record: dict[str, Any], device: str) -> OffP
 
 
 def _drop_checkpoints(folder: Path) -> None:
-    remains = folder / "checkpoint.partial"
-    shutil.rmtree(remains, ignore_errors=True)
-    for checkpoint in folder.glob("checkpoint-*"):
-        # renamed first: half a checkpoint must not look like a whole one
-        shutil.rmtree(checkpoint.rename(remains))
+    for remains in folder.glob("checkpoint*"):
+        if remains.is_dir():  # of an older form
+            shutil.rmtree(remains)
+        else:
+            remains.unlink()
 
 
 def n_parameters(model: OffPolicyAlgorithm) -> int:
@@ -318,8 +319,7 @@ def _replace(path: Path, rows: pd.DataFrame, key: dict[str, Any]) -> None:
 
 def steps_done(folder: Path) -> int:
     """Training steps of a run so far, as its folder tells: those of finished episodes and of the newest checkpoint."""
-    checkpoint = newest_checkpoint(folder)
-    done = 0 if checkpoint is None else checkpoint_step(checkpoint)
+    done = max(map(checkpoint_step, checkpoints(folder)), default=0)
     lived = 0
     for path in folder.glob("*monitor.csv"):
         with contextlib.suppress(OSError, ValueError, KeyError):  # just being written

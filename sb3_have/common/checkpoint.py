@@ -220,6 +220,8 @@ def write_checkpoint(folder: Path, model: OffPolicyAlgorithm, keep: int, **kwarg
     :return: whether it was saved; a warning tells why it was not, as on a full disk
     """
     path = folder / f"checkpoint-{model.num_timesteps}"
+    for remains in folder.glob("checkpoint-*.partial"):  # of a process that was killed while it wrote
+        remains.unlink()
     try:
         save_checkpoint(model, path, **kwargs)
     except OSError as error:
@@ -254,8 +256,6 @@ class ResumableCheckpointCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
-        for remains in self.folder.glob("checkpoint-*.partial"):  # of a process that was killed while it wrote
-            remains.unlink()
         self._last_step = self.model.num_timesteps
 
     def _on_rollout_start(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -177,7 +178,8 @@ def _failure(value: Any, layers: Sequence[Any]) -> str:
     try:
         dumps(value, layers)
     except Exception as error:
-        return f"{type(error).__name__}: {error}"
+        # without addresses, which would make every warning another one
+        return re.sub(r" at 0x[0-9a-f]+", "", f"{type(error).__name__}: {error}")
     return ""
 
 
