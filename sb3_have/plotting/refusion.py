@@ -85,22 +85,23 @@ def plot_refusion(response: Response) -> Figure:
     axes = figure.subplots(1, 3, sharex=True, sharey=True)
     filled = axes[0].contourf(response.q_global, response.q_lve, response.h, levels=16, cmap="cividis")
     lines = axes[0].contour(response.q_global, response.q_lve, response.h, levels=8, colors="white", linewidths=0.7)
-    axes[0].clabel(lines, fontsize=8, fmt="%.3g")
-    figure.colorbar(filled, ax=axes[0])
+    figure.colorbar(filled, ax=axes[0]).add_lines(lines)
     axes[0].set_title("H", fontsize=MEDIUM)
-    _draw_slope(figure, axes[1], response, response.slope_global, r"$\partial H/\partial q_g$")
-    _draw_slope(figure, axes[2], response, response.slope_lve, r"$\partial H/\partial q_l$")
+    # one scale for both, so that they can be compared
+    reach = max(1.0, float(np.abs([response.slope_global, response.slope_lve]).max()))
+    _draw_slope(figure, axes[1], response, response.slope_global, reach, r"$\partial H/\partial q_g$")
+    _draw_slope(figure, axes[2], response, response.slope_lve, reach, r"$\partial H/\partial q_l$")
     for axis in axes:
         axis.plot(*response.actual, "o", color="white", markeredgecolor="black", markersize=8, label="at this state")
         axis.set_xlabel("global value $q_g$")
+    axes[0].set(xlim=response.q_global[[0, -1]], ylim=response.q_lve[[0, -1]])
     axes[0].set_ylabel("weighted local value $q_l$")
     axes[0].legend(fontsize=9, loc="upper left")
     figure.suptitle(f"Re-fusion, {response.refusion}", fontsize=11)
     return figure
 
 
-def _draw_slope(figure: Figure, axis: Axes, response: Response, slope: np.ndarray, name: str) -> None:
-    reach = float(np.abs(slope).max()) or 1.0
+def _draw_slope(figure: Figure, axis: Axes, response: Response, slope: np.ndarray, reach: float, name: str) -> None:
     # purple below zero, orange above: told apart by colour-blind people, and by the hatch in greyscale
     mesh = axis.pcolormesh(
         response.q_global,
