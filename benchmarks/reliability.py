@@ -34,7 +34,7 @@ from benchmarks.reliability_runs import METHODS, VARIANTS, run
 DEFAULT_METHODS = ("gve", "gve-wide", "lve", "have", "have-dropout", "have-unsupervised")
 N_UPDATES = 8000
 OUT = RESULTS / "reliability"
-STANDARD_TASK = {"n_blind": 2, "corruption": 0.6}
+STANDARD_TASK: Mapping[str, Any] = {"n_blind": 2, "corruption": 0.6}
 COLUMNS = ["method", "seed", "updates", "measure", "value"]
 
 
