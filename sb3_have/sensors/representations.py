@@ -41,7 +41,7 @@ def voxel_grid(
 ) -> NDArray[np.float64]:
     """
     Voxel grid: each polarity is shared linearly between the two nearest of ``bins`` instants, tau = (bins - 1)
-    (t - t0) / (t1 - t0), V[b] = sum p max(0, 1 - |b - tau|) (Zhu et al., "Unsupervised Event-based Learning of
+    (t - t0) / (t1 - t0), ``V[b] = sum p max(0, 1 - |b - tau|)`` (Zhu et al., "Unsupervised Event-based Learning of
     Optical Flow, Depth, and Egomotion", CVPR 2019). Parameters, return and errors as :func:`stack_by_time`.
     """
     return represent(*_flatten(events, height, width), bins, t0, t1, height, width, "voxel")
