@@ -66,12 +66,12 @@ def export_onnx(
         require(name)
     policy = policy_of(model)
     space = policy.observation_space
-    if isinstance(space, spaces.Dict) and (taken := [key for key in space if key in OUTPUTS]):
+    if isinstance(space, spaces.Dict) and (taken := [key for key in space.spaces if key in OUTPUTS]):
         raise ValueError(f"observation key {taken[0]!r} is the name of an output of the file; rename the key.")
     warn_of_normalization(model)
     with _float32(policy):
         network = Network(policy)
-        proto = _to_proto(network, _observations(space, 2, policy))
+        proto = _to_proto(network)
         metadata = {
             "algorithm": None if model is policy else type(model).__name__,
             "observation_space": space_to_json(space),
@@ -106,6 +106,7 @@ class Network(nn.Module):
         assert isinstance(action_space, spaces.Box)  # as in every policy that can be exported
         actor: Any = policy.actor
         self.observation_space = policy.observation_space
+        self.keys = list(boxes(policy.observation_space))
         self.about: dict[str, Any] = {}
         self.assignment = None
         if isinstance(policy, MultiModalPolicy):
@@ -127,7 +128,10 @@ class Network(nn.Module):
         self.register_buffer("high", th.as_tensor(action_space.high, dtype=th.float32))
         self.eval().requires_grad_(False).to("cpu")
 
-    def forward(self, observations: PyTorchObs) -> tuple[th.Tensor, ...]:
+    def forward(self, inputs: list[th.Tensor]) -> tuple[th.Tensor, ...]:
+        observations: PyTorchObs = dict(zip(self.keys, inputs, strict=True))
+        if not isinstance(self.observation_space, spaces.Dict):
+            observations = inputs[0]
         if self.normalize_images is not None:
             observations = preprocess_obs(observations, self.observation_space, self.normalize_images)
         features = self.encoder(observations)
@@ -150,24 +154,26 @@ def _float32(policy: BasePolicy) -> Iterator[None]:
             module.precision = precision
 
 
-def _observations(space: spaces.Space[Any], batch_size: int, policy: BasePolicy) -> dict[str, np.ndarray]:
+def boxes(space: spaces.Space[Any]) -> dict[str, spaces.Space[Any]]:
+    """The spaces of the inputs by name."""
+    return space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
+
+
+def _observations(space: spaces.Space[Any], batch_size: int) -> dict[str, np.ndarray]:
     """Random observations by input name; the space's own generator is left alone."""
-    boxes = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
     observations = {}
-    for number, (key, box) in enumerate(boxes.items()):
+    for number, (key, box) in enumerate(boxes(space).items()):
         box = copy.deepcopy(box)
         box.seed(number)
         observations[key] = np.stack([box.sample() for _ in range(batch_size)])
     return observations
 
 
-def _to_proto(network: Network, observations: dict[str, np.ndarray]) -> Any:
+def _to_proto(network: Network) -> Any:
     """The network as an ONNX model, without the places in source files that PyTorch notes at each node."""
-    names = list(observations)
-    tensors = {key: th.from_numpy(value) for key, value in observations.items()}
-    batch = {key: {0: th.export.Dim.DYNAMIC} for key in names}
-    batch[names[0]] = {0: th.export.Dim("batch")}  # the name of all: they have to be equal
-    is_dict = isinstance(network.observation_space, spaces.Dict)
+    inputs = [th.from_numpy(value) for value in _observations(network.observation_space, 2).values()]
+    # the name of one batch is that of all, as they have to be equal
+    batch = [{0: th.export.Dim("batch") if number == 0 else th.export.Dim.DYNAMIC} for number in range(len(inputs))]
     # it tells everybody who has no torchvision that some operators are left out
     logger = logging.getLogger("torch.onnx._internal.exporter._registration")
     level = logger.level
@@ -178,10 +184,9 @@ def _to_proto(network: Network, observations: dict[str, np.ndarray]) -> Any:
             warnings.filterwarnings("ignore", r".*treespec, LeafSpec", FutureWarning)
             program = th.onnx.export(
                 network,
-                kwargs={"observations": tensors if is_dict else tensors["observation"]},
-                input_names=names,
+                (inputs,),
                 output_names=list(OUTPUTS[: 1 if network.assignment is None else 2]),
-                dynamic_shapes={"observations": batch if is_dict else batch["observation"]},
+                dynamic_shapes=(batch,),
                 opset_version=OPSET,
                 dynamo=True,
                 verbose=False,
@@ -190,21 +195,32 @@ def _to_proto(network: Network, observations: dict[str, np.ndarray]) -> Any:
         logger.setLevel(level)
     assert program is not None
     proto = program.model_proto
-    for part in (
-        proto,
-        proto.graph,
-        *proto.graph.node,
-        *proto.graph.value_info,
-        *proto.graph.input,
-        *proto.graph.output,
-    ):
+    graph = proto.graph
+    for part in (proto, graph, *graph.node, *graph.value_info, *graph.input, *graph.output):
         del part.metadata_props[:]
+    _name_inputs(graph, network.keys)
     return proto
+
+
+def _name_inputs(graph: Any, keys: list[str]) -> None:
+    """Names the inputs by the observation keys, and values that already have such a name otherwise."""
+    values = [*graph.input, *graph.output, *graph.value_info, *graph.initializer]
+    existing = {value.name for value in values} | {name for node in graph.node for name in (*node.input, *node.output)}
+    names = dict(zip((value.name for value in graph.input), keys, strict=True))
+    for name in existing.intersection(keys) - names.keys():
+        names[name] = f"{name}_"
+        while names[name] in existing.union(keys):
+            names[name] += "_"
+    for value in values:
+        value.name = names.get(value.name, value.name)
+    for node in graph.node:
+        node.input[:] = [names.get(name, name) for name in node.input]
+        node.output[:] = [names.get(name, name) for name in node.output]
 
 
 def _check_parity(content: bytes, policy: BasePolicy) -> None:
     """ValueError if onnxruntime makes of the file something else than ``predict`` does, as for an own ``_predict``."""
-    observations = _observations(policy.observation_space, 7, policy)
+    observations = _observations(policy.observation_space, 7)
     session = require("onnxruntime").InferenceSession(content, providers=["CPUExecutionProvider"])
     found = session.run(["action"], observations)[0]
     is_dict = isinstance(policy.observation_space, spaces.Dict)
