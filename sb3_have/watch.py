@@ -2,18 +2,20 @@
 
     python -m sb3_have.watch runs/have-0 --weather HardRainNight --out drive.mp4
 
-MODEL is a zip that SB3 saved, or the folder of a run of ``python -m sb3_have.train``, whose settings then tell the
-environment. Without them it is HighwayVision-v0 as in ``--config``, with the modalities and the image size that the
+MODEL is a zip that SB3 saved, a checkpoint, or the folder of a run of ``python -m sb3_have.train``, whose settings then
+tell the environment. Without them it is HighwayVision-v0 as in ``--config``, with the modalities and the image size that the
 model reads; ``--env`` and ``--env-kwargs`` name another one. The ending of ``--out`` decides between mp4 and GIF.
 """
 
 from __future__ import annotations
 
 import argparse
+import io
 import json
 import sys
 import zipfile
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +23,13 @@ from gymnasium import spaces
 from gymnasium.error import Error as GymnasiumError
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_have.common.archive import DamagedCheckpointError
+from sb3_have.common.checkpoint import checkpoint_info, checkpoints
 from sb3_have.common.recording import Recording, record_episode
 from sb3_have.configuration import env_wrapper, hyperparameter, load_config
 from sb3_have.envs.vision import MODALITIES
 from sb3_have.plotting import write_animation
-from sb3_have.train import algorithms, newest_checkpoint
+from sb3_have.train import algorithms
 
 ENV_ID = "HighwayVision-v0"
 CAMERAS = (ENV_ID, "CarlaVision-v0")
@@ -41,65 +45,82 @@ SAVED_BY = {
 
 
 def model_file(path: Path) -> Path:
-    """The zip of a model.
+    """The file that holds a model.
 
-    :param path: the zip, with or without its ending, a folder with ``model.zip`` or with checkpoints
+    :param path: a model, with or without the ending zip, a checkpoint, or a folder with ``model.zip`` or checkpoints
     :raises FileNotFoundError: if there is none
     """
     if path.is_dir():
-        checkpoint = newest_checkpoint(path)
-        candidates = [path / "model.zip", *([] if checkpoint is None else [checkpoint / "model.zip"])]
+        candidates = [path / "model.zip", *reversed(checkpoints(path))]
     else:
         candidates = [path, path.with_name(f"{path.name}.zip")]
     for candidate in candidates:
         if candidate.is_file():
             return candidate
-    raise FileNotFoundError(f"there is no model: looked for {', '.join(map(str, candidates))}")
+    looked = (
+        f"{path / 'model.zip'} and {path / 'checkpoint-<step>'}"
+        if path.is_dir()
+        else " and ".join(map(str, candidates))
+    )
+    raise FileNotFoundError(f"there is no model: looked for {looked}")
 
 
-def saved_algorithm(file: Path) -> str | None:
-    """Name of the algorithm that saved a model, None if it is not known here; nothing is unpickled to tell.
+def read_model(file: Path) -> tuple[io.BytesIO, dict[str, Any]]:
+    """A model as SB3 saved it, and what is known of its training; nothing is unpickled.
 
-    :param file: the zip
-    :raises ValueError: if it is no model that SB3 saved
+    :param file: a model or a checkpoint
+    :return: the model's zip; ``config``, ``env_id`` ... of the run of :mod:`sb3_have.train` that it is of, told by the
+        checkpoint or by one beside the model, else empty
+    :raises ValueError: if it is neither, or damaged
     """
     try:
         with zipfile.ZipFile(file) as archive:
-            policy: Mapping[str, Any] = json.loads(archive.read("data"))["policy_class"]
+            if "info.json" in archive.namelist():
+                told = json.loads(archive.read("info.json"))
+                return io.BytesIO(archive.read("model.zip")), dict(told.get("info", {}).get("settings", {}))
     except (zipfile.BadZipFile, KeyError, ValueError) as error:
         raise ValueError(f"{file} is not a model that SB3's save() wrote, or it is damaged: {error}") from error
+    for checkpoint in reversed(checkpoints(file.parent)):
+        with suppress(DamagedCheckpointError):
+            return io.BytesIO(file.read_bytes()), dict(checkpoint_info(checkpoint)["info"].get("settings", {}))
+    return io.BytesIO(file.read_bytes()), {}
+
+
+def saved_algorithm(model: io.BytesIO, name: Path | str = "the file") -> str | None:
+    """Name of the algorithm that saved a model, None if it is not known here; nothing is unpickled to tell.
+
+    :param model: the model's zip
+    :param name: of its file, for the error
+    :raises ValueError: if it is no model that SB3 saved
+    """
+    try:
+        with zipfile.ZipFile(model) as archive:
+            policy: Mapping[str, Any] = json.loads(archive.read("data"))["policy_class"]
+    except (zipfile.BadZipFile, KeyError, ValueError) as error:
+        raise ValueError(f"{name} is not a model that SB3's save() wrote, or it is damaged: {error}") from error
     module = str(policy.get("__module__", ""))
-    return next((name for prefix, name in SAVED_BY.items() if module.startswith(prefix)), None)
+    return next((algo for prefix, algo in SAVED_BY.items() if module.startswith(prefix)), None)
 
 
-def load_model(file: Path, algo: str | None = None, device: str = "auto") -> BaseAlgorithm:
-    """Load a model to watch it: its replay buffer is small.
+def load_model(file: Path, algo: str | None = None, device: str = "auto") -> tuple[BaseAlgorithm, dict[str, Any]]:
+    """Load a model to watch it, with a small replay buffer.
 
-    :param file: the zip
+    :param file: a model or a checkpoint; the model is unpickled, as SB3 does
     :param algo: name in :func:`sb3_have.train.algorithms`; None is the one that saved it
     :param device: of the model
+    :return: the model and the settings of its run, see :func:`read_model`
     :raises ValueError: if the file is no model, or of another algorithm
     """
-    saved = saved_algorithm(file)
-    name = algo or saved or "havesac"
-    if saved is not None and name != saved:
-        raise ValueError(f"{file} was saved by {saved}, not by {name}: leave --algo out")
+    saved, settings = read_model(file)
+    known = saved_algorithm(saved, file)
+    name = algo or known or "havesac"
+    if known is not None and name != known:
+        raise ValueError(f"{file} was saved by {known}, not by {name}: leave --algo out")
     try:
-        return algorithms()[name].load(file, device=device, custom_objects={"buffer_size": 1000})
+        model = algorithms()[name].load(saved, device=device, custom_objects={"buffer_size": 1000})
     except Exception as error:  # whatever a file of another kind makes SB3 stumble over
         raise ValueError(f"{file} cannot be loaded as {name}, give its --algo: {error!r}") from error
-
-
-def run_settings(file: Path) -> dict[str, Any]:
-    """``config``, ``env_id`` ... of the training run that a model is of; empty if it is of none.
-
-    :param file: the zip, in the run's folder or in one of its checkpoints
-    """
-    checkpoint = newest_checkpoint(file.parent)
-    for folder in (file.parent, checkpoint):
-        if folder is not None and (folder / "state.json").is_file():
-            return dict(json.loads((folder / "state.json").read_text()).get("settings", {}))
-    return {}
+    return model, settings
 
 
 def fitting_env_kwargs(space: spaces.Space[Any]) -> dict[str, Any]:
@@ -141,7 +162,9 @@ def environment(
 def main(arguments: list[str] | None = None) -> None:
     """Command line of ``python -m sb3_have.watch``."""
     parser = argparse.ArgumentParser(prog="python -m sb3_have.watch", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("model", type=Path, metavar="MODEL", help="zip of a model, or folder of a training run")
+    parser.add_argument(
+        "model", type=Path, metavar="MODEL", help="zip of a model, checkpoint, or folder of a training run"
+    )
     parser.add_argument("--out", type=Path, default=Path("drive.mp4"), help=".mp4 or .gif; default: %(default)s")
     parser.add_argument("--env", help=f"environment id; default: the run's, else {ENV_ID}")
     parser.add_argument(
@@ -186,8 +209,8 @@ def watch(args: argparse.Namespace) -> Recording:
     """Drive the episode and write its film; arguments as in :func:`main`."""
     args.out.parent.mkdir(parents=True, exist_ok=True)
     file = model_file(args.model)
-    model = load_model(file, args.algo, args.device)
-    env_id, env_kwargs, config = environment(model, run_settings(file), args.env, args.config)
+    model, settings = load_model(file, args.algo, args.device)
+    env_id, env_kwargs, config = environment(model, settings, args.env, args.config)
     env_kwargs |= dict(args.env_kwargs) | ({} if args.weather is None else {"weather": args.weather})
     print(f"{env_id} {env_kwargs}")
     recording = record_episode(

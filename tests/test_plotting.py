@@ -13,8 +13,8 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from sb3_have.common.drivers import KeepStraightDriver
-from sb3_have.plotting import modality_colours, plot_learning_curve, plot_modality_weights, write_gif
 from sb3_have.common.recording import Recording, record_episode
+from sb3_have.plotting import Frames, modality_colours, plot_learning_curve, plot_modality_weights, write_gif
 
 
 class Weighing(KeepStraightDriver):
@@ -97,10 +97,13 @@ def test_gif_loops_and_its_bars_are_the_weights(recording: Recording, tmp_path: 
     with Image.open(path) as gif:
         assert gif.n_frames == 8 and gif.info["loop"] == 0 and gif.width == 240  # type: ignore[attr-defined]
         colour = np.array([int(modality_colours(["depth"])["depth"][i : i + 2], 16) for i in (1, 3, 5)])
+        frames = Frames(recording, 240)
+        top = 2 * 18 + frames.tile + 4 + 18  # the second bar, under a line of facts, the names and the images
         for step in range(8):
             gif.seek(step)
-            bar = np.abs(np.asarray(gif.convert("RGB")).astype(int) - colour).sum(-1) < 60
-            assert bar.sum(1).max() == pytest.approx(recording.weights["depth"][step] * (240 - 105), abs=1.5)
+            bar = np.abs(np.asarray(gif.convert("RGB")).astype(int) - colour).sum(-1)[top : top + 18] < 60
+            expected = recording.weights["depth"][step] * (frames.right - frames.left)
+            assert bar.sum(1).max() == pytest.approx(expected, abs=1.5)
 
 
 def test_gif_keeps_its_size_limit(tmp_path: Path) -> None:

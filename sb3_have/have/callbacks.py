@@ -2,23 +2,21 @@
 
 from __future__ import annotations
 
-import random
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch as th
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Image, TensorBoardOutputFormat
 
+from sb3_have.common.checkpoint import same_random_numbers
 from sb3_have.common.files import write_atomically
 from sb3_have.common.recording import record_episode, weighing
 from sb3_have.plotting.episode import plot_modality_weights
@@ -159,16 +157,6 @@ class ModalityWeightsCallback(BaseCallback):
             self.logger.record("have/episode", Image(_pixels(figure), "HWC"), exclude=NOT_TEXT)
         if self.verbose >= 1:
             print(f"Step {self.num_timesteps}: episode of {len(recording.infos)} steps drawn")
-
-
-@contextmanager
-def same_random_numbers() -> Iterator[None]:
-    """What is done inside takes no random numbers from those outside: python's, numpy's and torch's generators."""
-    states = random.getstate(), np.random.get_state()
-    with th.random.fork_rng():
-        yield
-    random.setstate(states[0])
-    np.random.set_state(states[1])
 
 
 def _pixels(figure: Figure) -> np.ndarray:
