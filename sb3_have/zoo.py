@@ -225,8 +225,7 @@ class CommandLine:
                 hyperparams, _ = manager.read_hyperparameters()
             params = _in_python(hyperparams)
         except ValueError as error:
-            known = f"; --method {self.algo} is HAVESAC's" if self.algo in config_names() and not self.conf else ""
-            self.fail(f"{error}{known}")
+            self.fail(str(error))
         # As sb3_have.train does: less memory than SB3's buffer takes for stacked images
         n_stack, has_buffer = hyperparams.get("frame_stack") or 1, "replay_buffer_class" in hyperparams
         if self.algo in ("tqc", "crossq") and n_stack > 1 and not has_buffer and hyperparams.get("n_steps", 1) == 1:

@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import yaml
 import zoo_fixtures
@@ -142,6 +141,6 @@ def test_training_goes_on_from_a_model(tmp_path: Path) -> None:
 
 
 def test_workers_know_the_environments(tmp_path: Path) -> None:
-    options = ["--algo", "havesac", "--env", VECTORS, "-n", "10", "--eval-freq", "10", "--eval-episodes", "1"]
+    options = ["--algo", "havesac", "--env", VECTORS, "-n", "10", "--eval-freq", "-1"]
     train(tmp_path, *options, "--vec-env", "subproc", "-params", *SMALL)
-    assert np.isfinite(evaluations(tmp_path)["results"]).all()
+    assert load("havesac", tmp_path).num_timesteps == 10
