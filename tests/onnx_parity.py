@@ -86,8 +86,8 @@ class Uneven(RandomSensors):
 
     def __init__(self, space: spaces.Space[Any]):
         super().__init__(space)
-        low, high = np.float32([[-2, 0, 5], [-1, -1, -1]]), np.float32([[1, 7, 6], [1, 0, 3]])
-        self.action_space = spaces.Box(low, high)
+        low, high = [[-2, 0, 5], [-1, -1, -1]], [[1, 7, 6], [1, 0, 3]]
+        self.action_space = spaces.Box(np.array(low, np.float32), np.array(high, np.float32))
 
 
 def enliven(policy: Any) -> None:

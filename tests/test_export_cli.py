@@ -33,7 +33,7 @@ def test_from_zip_to_safetensors_to_onnx(zipped: Path, capsys: pytest.CaptureFix
     actions = [
         one.predict(observation, deterministic=True)[0] for one in (HAVESAC.load(zipped), load_policy(folder, "cpu"))
     ]
-    assert np.array_equal(*actions)
+    assert np.array_equal(actions[0], actions[1])
     main([str(folder), "--format", "onnx"])
     assert metadata(file)["frame_stack"] == 1
     assert f"{file}: 0." in capsys.readouterr().out

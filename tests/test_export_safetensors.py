@@ -70,7 +70,7 @@ def assert_same_policy(model: Any, policy: Any) -> None:
             if model.use_sde:
                 one.reset_noise()
             actions.append(one.predict(observation, deterministic=deterministic)[0])
-        assert np.array_equal(*actions)
+        assert np.array_equal(actions[0], actions[1])
     if isinstance(policy, MultiModalPolicy):
         obs, _ = policy.obs_to_tensor(observation)
         action = th.full((1, 2), 0.3)
@@ -102,7 +102,8 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "bounds": {
         "space": spaces.Dict(
             OrderedDict(
-                z=spaces.Box(-np.inf, np.inf, (2,)), a=spaces.Box(np.float32([-1.5, 0.1]), np.float32([np.inf, 9.0]))
+                z=spaces.Box(-np.inf, np.inf, (2,)),
+                a=spaces.Box(np.array([-1.5, 0.1], np.float32), np.array([np.inf, 9.0], np.float32)),
             )
         )
     },
@@ -232,6 +233,15 @@ def test_loading_leaves_random_numbers_and_training_alone(tmp_path: Path) -> Non
     assert not policy.training and not policy.critic.encoder.training
 
 
+def test_exploration_is_that_of_the_loaded_deviations(tmp_path: Path) -> None:
+    model = tiny_model(vectors_space(), use_sde=True)
+    log_std: Any = model.actor.log_std
+    log_std.data.fill_(5.0)  # 0.05 at first
+    export_safetensors(model, tmp_path)
+    actor: Any = loaded(tmp_path).actor
+    assert actor.action_dist.exploration_mat.std() > 10
+
+
 Damage = Callable[[dict[str, Any], dict[str, th.Tensor]], None]
 
 
@@ -245,7 +255,10 @@ def set_in(*keys: str, value: Any) -> Damage:
 
 
 def drop(name: str) -> Damage:
-    return lambda config, tensors: (tensors if name in tensors else config).pop(name)
+    def damage(config: dict[str, Any], tensors: dict[str, th.Tensor]) -> None:
+        del (tensors if name in tensors else config)[name]  # type: ignore[attr-defined]
+
+    return damage
 
 
 def put(name: str, tensor: th.Tensor) -> Damage:
@@ -397,8 +410,8 @@ def test_what_cannot_be_exported(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     with pytest.raises(ValueError, match="expected the name of a folder"):
         export_safetensors(model, tmp_path / "file")
-    with th.no_grad():
-        model.actor.mu.bias[1] = th.nan
+    mu: Any = model.actor.mu
+    mu.bias.data[1] = th.nan
     with pytest.raises(ValueError, match=r"MultiModalPolicy: tensor 'actor\.mu\.bias': expected finite.*found 1 of 2"):
         export_safetensors(model, tmp_path / "policy")
     assert not (tmp_path / "policy").exists()
