@@ -3,8 +3,9 @@
     python -m sb3_have.watch runs/have-0 --weather HardRainNight --out drive.mp4
 
 MODEL is a zip that SB3 saved, a checkpoint, or the folder of a run of ``python -m sb3_have.train``, whose settings then
-tell the environment. Without them it is HighwayVision-v0 as in ``--config``, with the modalities and the image size that the
-model reads; ``--env`` and ``--env-kwargs`` name another one. The ending of ``--out`` decides between mp4 and GIF.
+tell the environment. Without them it is HighwayVision-v0 as in ``--config``, with the modalities and the image size
+that the model reads; ``--env`` and ``--env-kwargs`` name another one. The ending of ``--out`` decides between mp4 and
+GIF.
 """
 
 from __future__ import annotations

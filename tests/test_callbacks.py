@@ -136,9 +136,9 @@ def test_the_episode_is_that_of_the_evaluation_environment(tmp_path: Path) -> No
     assert {path.name for path in tmp_path.iterdir()} == {"weights-20.png", "weights-40.png", "weights-60.png"}
     with Image.open(tmp_path / "weights-60.png") as strip:
         assert strip.width > 600 and np.asarray(strip).std() > 10
-    count = env.obs_rms["a"].count  # type: ignore[index]
+    count = env.obs_rms["a"].count
     recording = record_episode(model, RandomSensors(vectors_space(), 9), seed=3)
-    assert env.obs_rms["a"].count == count and len(recording.rewards) == 9  # type: ignore[index]
+    assert env.obs_rms["a"].count == count and len(recording.rewards) == 9
     normalised = env.normalize_obs({key: value[None] for key, value in recording.observations[4].items()})
     assert recording.weights["a"][4] == pytest.approx(model.modality_weights(normalised)["a"][0], rel=1e-5)
 

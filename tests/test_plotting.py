@@ -78,7 +78,7 @@ def test_modality_weights_over_the_episode(recording: Recording) -> None:
     assert len(thumbnails) == 2 * 4
     assert [axis.get_ylabel() for axis in thumbnails[::4]] == ["rgb", "depth"]
     lines = {str(line.get_label()): line for line in curves.get_lines()}
-    expected = np.column_stack([np.arange(8) * recording.seconds, recording.weights["depth"]])
+    expected = np.column_stack([recording.times, recording.weights["depth"]])
     np.testing.assert_allclose(points(lines["depth"]), expected)
     # the thumbnails are those of the instants marked in the curves
     shown = [int(np.asarray(axis.images[0].get_array())[0, 0, 0]) for axis in thumbnails[:4]]

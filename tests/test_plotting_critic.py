@@ -138,9 +138,8 @@ def test_the_sign_of_the_slopes_is_seen() -> None:
     for given, hatched in ((response, False), (falling, True)):
         figure = plot_refusion(given)
         surface, left, right = figure.axes[:3]
-        assert not any(part.hatches for part in left.collections if hasattr(part, "hatches"))  # type: ignore[attr-defined]
-        found = [part.hatches for part in right.collections if getattr(part, "hatches", None)]
-        assert bool(found) is hatched
+        assert not any(getattr(part, "hatches", None) for part in left.collections)
+        assert any(getattr(part, "hatches", None) for part in right.collections) is hatched
         assert surface.get_xlabel() == "global value $q_g$" and "q_l" in surface.get_ylabel()
     share = 100 * (falling.slope_lve < 0).mean()
     assert right.get_title().endswith(f"-0.50 to 0.25, negative on {share:.0f} %")

@@ -10,7 +10,7 @@ import torch as th
 from envs import RandomSensors, sensors_space, tiny_model, vector, vectors_space
 from fake_drive import ENV_ID
 from gymnasium import spaces
-from stable_baselines3 import SAC
+from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from sb3_have import HAVESAC
@@ -94,10 +94,10 @@ def test_the_global_critic_alone_has_a_value_and_no_weights() -> None:
 @pytest.mark.parametrize("normalize_first", [True, False])
 def test_the_wrappers_of_the_training_are_put_on_in_their_order(normalize_first: bool) -> None:
     env = DummyVecEnv([lambda: RandomSensors(vectors_space())])
-    model: SAC
-    if normalize_first:  # which HAVESAC refuses
+    model: PPO | SAC
+    if normalize_first:  # which off-policy algorithms refuse, having to store what is not normalised
         stacked = VecFrameStack(VecNormalize(env), 3, {"a": "first", "b": "last"})
-        model = SAC("MultiInputPolicy", stacked, policy_kwargs={"net_arch": [8]}, buffer_size=50, seed=0, device="cpu")
+        model = PPO("MultiInputPolicy", stacked, n_steps=10, batch_size=10, n_epochs=1, seed=0, device="cpu")
     else:
         model = tiny_model(vectors_space(), env=VecNormalize(VecFrameStack(env, 3)))
     model.learn(20)
@@ -116,7 +116,7 @@ def test_the_wrappers_of_the_training_are_put_on_in_their_order(normalize_first:
 
 def test_normalised_images_do_not_change_the_space_of_the_environment() -> None:
     """VecNormalize writes into the space that it is given."""
-    space = spaces.Dict({"camera": spaces.Box(0, 255, (36, 36, 3), np.uint8), "state": vector(2)})
+    space = spaces.Dict({"camera": spaces.Box(0, 255, (3, 36, 36), np.uint8), "state": vector(2)})
     env = VecNormalize(DummyVecEnv([lambda: RandomSensors(deepcopy(space))]), norm_obs_keys=["camera", "state"])
     keywords: dict[str, Any] = {"net_arch": [8], "normalize_images": False}
     model = SAC("MultiInputPolicy", env, policy_kwargs=keywords, buffer_size=50, device="cpu")

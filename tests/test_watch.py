@@ -25,7 +25,7 @@ T = 6
 def film(path: Path) -> tuple[np.ndarray, float]:
     """RGB frames (n, H, W, 3) and frames per second."""
     video = cv2.VideoCapture(str(path))
-    frames = []
+    frames: list[np.ndarray] = []
     while True:
         read, frame = video.read()
         if not read:
