@@ -97,7 +97,7 @@ def test_driving_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     from gymnasium.wrappers import HumanRendering
 
     shown: list[Any] = []
-    show = HumanRendering._render_frame
+    show: Any = HumanRendering._render_frame
     monkeypatch.setattr(HumanRendering, "_render_frame", lambda self: shown.append(show(self)))
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     env_kwargs = {**load_config("gve", DRIVING)["env_kwargs"], **SMALL_IMAGES, "max_episode_steps": 6}
