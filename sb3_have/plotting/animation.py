@@ -43,7 +43,7 @@ class Frames:
         self.recording, self.width = recording, width - width % 2  # video codecs want even numbers
         self.styles = modality_styles(recording.weights)
         self.font = ImageFont.load_default(11 if width < 400 else 13)
-        names = max((self.font.getlength(name) for name in self.styles), default=0.0)
+        names = max(self.font.getlength(name) for name in ("100 %", *self.styles))
         self.left, self.right = (
             round(min(names, 0.4 * width)) + 12,
             self.width - round(self.font.getlength("100 %")) - 8,

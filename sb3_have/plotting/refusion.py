@@ -84,7 +84,13 @@ def plot_refusion(response: Response) -> Figure:
     figure = Figure(figsize=(11.0, 3.7), layout="constrained")
     axes = figure.subplots(1, 3, sharex=True, sharey=True)
     filled = axes[0].contourf(response.q_global, response.q_lve, response.h, levels=16, cmap="cividis")
-    lines = axes[0].contour(response.q_global, response.q_lve, response.h, levels=8, colors="white", linewidths=0.7)
+    lines = axes[0].contour(
+        *(response.q_global, response.q_lve, response.h),
+        levels=8,
+        colors="white",
+        linewidths=0.7,
+        negative_linestyles="solid",
+    )
     figure.colorbar(filled, ax=axes[0]).add_lines(lines)
     axes[0].set_title("H", fontsize=MEDIUM)
     # one scale for both, so that they can be compared
