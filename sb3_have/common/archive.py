@@ -183,6 +183,8 @@ def check_archive(path: Path) -> None:
 def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
     try:
         with zipfile.ZipFile(path) as archive:
+            # cut off, the file may end with that of the model, which is an archive too
+            archive.getinfo("info.json")
             yield archive
     except (*DAMAGES, OSError) as error:
         if isinstance(error, OSError) and error.errno not in (errno.EINVAL, errno.EIO, None):

@@ -126,7 +126,10 @@ def load_checkpoint(
     """
     file = _file_of(Path(path))
     _, saved, state = read_archive(file)
-    model = state["algorithm"].load(saved, env=env, device=device, force_reset=False)
+    with warnings.catch_warnings():
+        # SB3 would warn that n-step returns have to be set up: they are, in the replay buffer of the checkpoint
+        warnings.filterwarnings("ignore", message="`n_steps=")
+        model = state["algorithm"].load(saved, env=env, device=device, force_reset=False)
     model.observation_space, model.action_space = restore_environments(model.env, state["environments"])
     model.replay_buffer = _fitted(state["replay_buffer"], model)
     if state["environments"].lost:

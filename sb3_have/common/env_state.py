@@ -139,8 +139,9 @@ def _gym_layers(env: gym.Env[Any, Any]) -> list[Any]:
 
 def _capture(layers: Sequence[Any], shared: Any) -> LayersState:
     names, states = [type(layer).__qualname__ for layer in layers], [_attributes(layer) for layer in layers]
+    known = [set(vars(layer)) for layer in layers]
     try:
-        return LayersState(names, dumps((states, shared), layers), [])
+        return LayersState(names, dumps((states, known, shared), layers), [])
     except Exception:  # whatever the environment's objects raise when they are asked for their state
         lost = [
             {name: reason for name, value in state.items() if (reason := _failure(value, layers))} for state in states
@@ -159,7 +160,7 @@ def _capture(layers: Sequence[Any], shared: Any) -> LayersState:
         for owner, failures in zip(names, lost, strict=True)
         for name, reason in failures.items()
     ]
-    return LayersState(names, dumps((rest, shared), layers), told)
+    return LayersState(names, dumps((rest, known, shared), layers), told)
 
 
 def _attributes(layer: Any) -> dict[str, Any]:
@@ -190,10 +191,10 @@ def _restore(layers: Sequence[Any], state: LayersState) -> Any:
             f"the checkpoint is of environments with other wrappers: {' > '.join(state.names)}, and it was given "
             f"{' > '.join(names)}; make them as in the training that wrote it"
         )
-    states, shared = loads(state.pickled, layers)
-    for layer, attributes in zip(layers, states, strict=True):
+    states, known, shared = loads(state.pickled, layers)
+    for layer, attributes, names in zip(layers, states, known, strict=True):
         if not state.lost:  # what is computed once and kept (functools.cached_property) may be of the old state
-            for name in _attributes(layer).keys() - attributes.keys():
+            for name in vars(layer).keys() - names:
                 del vars(layer)[name]
         vars(layer).update(attributes)
     return shared

@@ -1,0 +1,167 @@
+"""Trainings that go on from a checkpoint end with the bits of those that never stopped."""
+
+import multiprocessing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from envs import TINY, RandomSensors, vectors_space
+from gymnasium.wrappers import TransformReward
+from resuming import Drifting, assert_resumes, assert_same, everything
+from sb3_contrib import TQC
+from stable_baselines3 import SAC, TD3, HerReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.envs import BitFlippingEnv
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize
+
+from sb3_have import HAVESAC, DeepMDPCallback
+from sb3_have.common.checkpoint import ResumableCheckpointCallback, load_checkpoint, save_checkpoint
+from sb3_have.common.crossq import MultiInputCrossQ
+from sb3_have.common.env_state import ResumableEnv
+
+
+def sac(env: Any, algorithm: Any = SAC, policy: str = "MlpPolicy", **kwargs: Any) -> Any:
+    policy_kwargs = {"net_arch": [8], **kwargs.pop("policy_kwargs", {})}
+    defaults: dict[str, Any] = {"buffer_size": 100, "learning_starts": 8, "batch_size": 8, "seed": 0, "device": "cpu"}
+    return algorithm(policy, env, policy_kwargs=policy_kwargs, **{**defaults, **kwargs})
+
+
+def have(env: Any, **kwargs: Any) -> HAVESAC:
+    model: HAVESAC = sac(env, HAVESAC, "MultiInputPolicy", policy_kwargs=TINY, **kwargs)
+    return model
+
+
+def drifting(n_envs: int = 1) -> VecEnv:
+    return DummyVecEnv([lambda: Monitor(Drifting())] * n_envs)
+
+
+def normalized(n_envs: int = 1) -> VecEnv:
+    return VecNormalize(VecFrameStack(drifting(n_envs), 3))
+
+
+def pendulum() -> gym.Env[Any, Any]:
+    """Stock, with a function in a wrapper."""
+    return TransformReward(gym.make("Pendulum-v1", max_episode_steps=31), lambda reward: 0.1 * float(reward))
+
+
+def highway(n_envs: int = 1) -> VecEnv:
+    kwargs: dict[str, Any] = {"image_size": 36, "modalities": ("rgb", "event"), "vehicles_count": 3}
+    make = partial(gym.make, "HighwayVision-v0", weather="random", max_episode_steps=13, **kwargs)
+    return VecFrameStack(DummyVecEnv([lambda: Monitor(make())] * n_envs), 2)
+
+
+def goals() -> gym.Env[Any, Any]:
+    return BitFlippingEnv(n_bits=3, continuous=True, max_steps=5)
+
+
+def noise(size: int) -> OrnsteinUhlenbeckActionNoise:
+    return OrnsteinUhlenbeckActionNoise(np.zeros(size), np.full(size, 0.5))
+
+
+CASES: dict[str, tuple[Any, Any]] = {
+    "every step": (sac, drifting),
+    "every 2nd step of 2": (partial(sac, train_freq=2, gradient_steps=2), partial(drifting, 2)),
+    "every episode": (partial(sac, train_freq=(1, "episode")), pendulum),
+    "normalized": (sac, normalized),
+    "normalized, 2": (sac, partial(normalized, 2)),
+    "gSDE": (partial(sac, use_sde=True, sde_sample_freq=3, train_freq=2), partial(drifting, 2)),
+    "overlapping observations": (
+        partial(sac, optimize_memory_usage=True, replay_buffer_kwargs={"handle_timeout_termination": False}),
+        drifting,
+    ),
+    "n steps": (partial(sac, n_steps=3), drifting),
+    "TQC, temperature given": (partial(sac, algorithm=TQC, ent_coef=0.1), drifting),
+    "TD3 with noise, 2": (lambda env: sac(env, TD3, action_noise=noise(2)), partial(drifting, 2)),
+    "goals": (
+        lambda env: sac(env, SAC, "MultiInputPolicy", replay_buffer_class=HerReplayBuffer, learning_starts=12),
+        goals,
+    ),
+    "CrossQ": (
+        lambda env: sac(env, MultiInputCrossQ, "MultiInputPolicy", learning_rate=lambda left: 1e-3 * left),
+        lambda: RandomSensors(vectors_space()),
+    ),
+    "HAVE, vectors": (
+        partial(have, policy_delay=2, modality_dropout=0.3),
+        partial(gym.make, "ReliabilityDrive-v0"),
+    ),
+    "HAVE, vectors, gSDE": (partial(have, use_sde=True), lambda: RandomSensors(vectors_space())),
+    "HAVE, images": (partial(have, n_steps=3, replay_buffer_kwargs={"storage": "mmap"}), highway),
+    "HAVE, images, 2": (partial(have, random_shift=2), partial(highway, 2)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_resumed_training_is_the_same(case: str, tmp_path: Path) -> None:
+    make_model, make_env = CASES[case]
+    assert_resumes(tmp_path, make_model, make_env, 23, 42)
+
+
+def test_five_hundred_steps_later(tmp_path: Path) -> None:
+    assert_resumes(tmp_path, partial(sac, train_freq=4, buffer_size=400), normalized, 100, 600)
+
+
+def test_schedules_go_on(tmp_path: Path) -> None:
+    def deep_mdp() -> list[BaseCallback]:
+        return [DeepMDPCallback(transition_coef=0.5, schedule=lambda left: left**2)]
+
+    make_env = partial(RandomSensors, vectors_space())
+    model = assert_resumes(tmp_path, partial(have, learning_rate=lambda left: 1e-3 * left), make_env, 23, 40, deep_mdp)
+    assert isinstance(model, HAVESAC) and model.auxiliary_coefs["transition"] < 0.01
+
+
+def test_worker_processes(tmp_path: Path) -> None:
+    multiprocessing.get_context("forkserver").set_forkserver_preload(["resuming", "sb3_have.common.env_state"])
+
+    def make_env() -> VecEnv:
+        return VecNormalize(SubprocVecEnv([lambda: ResumableEnv(Monitor(Drifting()))] * 2))
+
+    assert_resumes(tmp_path, sac, make_env, 23, 40)
+
+
+def test_saving_does_not_disturb(tmp_path: Path) -> None:
+    without = everything(sac(drifting(), use_sde=True).learn(40))
+    saving = sac(drifting(), use_sde=True).learn(40, ResumableCheckpointCallback(tmp_path, 5))
+    assert len([*tmp_path.iterdir()]) == 2
+    assert_same(everything(saving), without)
+
+
+def test_between_two_calls_of_learn(tmp_path: Path) -> None:
+    model = sac(normalized(), use_sde=True)
+    model.learn(20)
+    save_checkpoint(model, tmp_path / "mine")
+    model.learn(20, reset_num_timesteps=False)
+    other = load_checkpoint(tmp_path / "mine", normalized(), device="cpu")
+    other.learn(20, reset_num_timesteps=False)
+    assert_same(everything(other), everything(model))
+
+
+def test_loaded_model_can_be_saved_at_once(tmp_path: Path) -> None:
+    make_model = partial(sac, use_sde=True, action_noise=noise(2))
+    first = make_model(drifting())
+    first.learn(40, ResumableCheckpointCallback(tmp_path, 23))
+    again = load_checkpoint(tmp_path / "checkpoint-23", drifting(), device="cpu")
+    save_checkpoint(again, tmp_path / "copy")
+    second = load_checkpoint(tmp_path / "copy", drifting(), device="cpu")
+    second.learn(17, reset_num_timesteps=False)
+    assert_same(everything(second), everything(first))
+
+
+def test_monitor_goes_on_with_its_file(tmp_path: Path) -> None:
+    def make_env(override: bool) -> VecEnv:
+        return DummyVecEnv([lambda: Monitor(Drifting(), str(tmp_path / "monitor.csv"), override_existing=override)])
+
+    env = make_env(True)
+    sac(env).learn(23, ResumableCheckpointCallback(tmp_path, 23))
+    env.close()
+    env = make_env(False)
+    load_checkpoint(tmp_path, env, device="cpu").learn(20, reset_num_timesteps=False)
+    env.close()
+    _, head, *rows = (tmp_path / "monitor.csv").read_text().splitlines()
+    assert head.startswith("r,l,t") and [row.split(",")[1] for row in rows] == ["9"] * 4
+    times = [float(row.split(",")[2]) for row in rows]
+    assert times == sorted(times)

@@ -1,0 +1,200 @@
+"""Files of checkpoints: whole or not there, damaged ones refused by name, full disks survived."""
+
+import errno
+import os
+import re
+import sys
+import tracemalloc
+import warnings
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+from resuming import Drifting, assert_same, everything, leaves
+from stable_baselines3 import SAC
+from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_have.common.archive import DamagedCheckpointError, check_archive, dumps, loads, read_archive, write_archive
+from sb3_have.common.checkpoint import (
+    ResumableCheckpointCallback,
+    checkpoint_info,
+    load_checkpoint,
+    newest_checkpoint,
+    save_checkpoint,
+)
+
+
+def make_env() -> DummyVecEnv:
+    return DummyVecEnv([lambda: Monitor(Drifting())])
+
+
+def make_model(**kwargs: Any) -> SAC:
+    defaults: dict[str, Any] = {"buffer_size": 60, "learning_starts": 8, "batch_size": 8, "seed": 0, "device": "cpu"}
+    return SAC("MlpPolicy", make_env(), policy_kwargs={"net_arch": [8]}, **{**defaults, **kwargs})
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def contents(path: Path) -> dict[str, bytes]:
+    with zipfile.ZipFile(path) as file:
+        return {name: file.read(name) for name in file.namelist()}
+
+
+def full_disk(*args: Any) -> None:
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def test_the_newest_stay(tmp_path: Path) -> None:
+    make_model().learn(35, ResumableCheckpointCallback(tmp_path / "new" / "folder", 10, keep=3))
+    assert names(tmp_path / "new" / "folder") == ["checkpoint-20", "checkpoint-30", "checkpoint-35"]
+    with pytest.raises(ValueError, match="keep=0"):
+        ResumableCheckpointCallback(tmp_path, 10, keep=0)
+
+
+def test_info_is_read_without_the_rest(tmp_path: Path) -> None:
+    model = make_model().learn(9)
+    save_checkpoint(model, tmp_path / "mine", info={"minutes": 1.5})
+    assert checkpoint_info(tmp_path / "mine") == {"steps": 9, "algorithm": "SAC", "info": {"minutes": 1.5}}
+
+
+def test_damage_is_refused_by_name(tmp_path: Path) -> None:
+    """Cut off anywhere, or one byte another: nothing is unpickled, and the checkpoint before is taken."""
+    callback = ResumableCheckpointCallback(tmp_path, 10)
+    make_model().learn(20, callback)
+    newest = tmp_path / "checkpoint-20"
+    whole, intact, rng = newest.read_bytes(), contents(newest), np.random.default_rng(0)
+    n_refused = 0
+    for i, position in enumerate(rng.integers(0, len(whole) - 100, 30).tolist()):
+        broken = bytearray(whole)
+        broken[position] ^= 1 << rng.integers(8)
+        newest.write_bytes(bytes(broken) if i % 2 else whole[:position])
+        try:
+            check_archive(newest)
+        except DamagedCheckpointError as error:
+            assert re.search(r"checkpoint-20 is damaged \(.*\); remove it", str(error))
+            n_refused += 1
+        else:  # a bit of the zip format that is there twice, or of no use
+            assert contents(newest) == intact
+        if i < 6:
+            with pytest.raises(DamagedCheckpointError, match="checkpoint-20 is damaged"):
+                load_checkpoint(newest, make_env())
+    assert n_refused >= 27
+    with pytest.warns(UserWarning, match="checkpoint-20 is damaged.*the one before it is taken"):
+        assert newest_checkpoint(tmp_path) == tmp_path / "checkpoint-10"
+    with pytest.warns(UserWarning, match="checkpoint-20 is damaged"):
+        model = load_checkpoint(tmp_path, make_env(), device="cpu")
+    assert model.num_timesteps == 10
+    model.learn(10, callback, reset_num_timesteps=False)
+    assert newest_checkpoint(tmp_path) == newest
+
+
+def test_what_is_no_checkpoint(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="has no checkpoint-<step> that can be read"):
+        load_checkpoint(tmp_path, make_env())
+    with pytest.raises(FileNotFoundError):
+        load_checkpoint(tmp_path / "nowhere", make_env())
+    make_model().save(tmp_path / "model.zip")
+    with pytest.raises(DamagedCheckpointError, match=r"model\.zip is damaged"):
+        load_checkpoint(tmp_path / "model.zip", make_env())
+    (tmp_path / "replay_buffer.pkl").touch()
+    with pytest.raises(ValueError, match="of an older form"):
+        load_checkpoint(tmp_path, make_env())
+
+
+@pytest.mark.parametrize("where", ["write", "fsync", "replace"])
+def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str) -> None:
+    """A warning; the training ends as it would have, what was there is still there, and nothing is left half."""
+    expected = everything(make_model().learn(30))
+
+    class DiskThatFills(ResumableCheckpointCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 15:
+                if where == "write":
+                    monkeypatch.setattr(zipfile._ZipWriteFile, "write", full_disk)  # type: ignore[attr-defined]
+                else:
+                    monkeypatch.setattr(os, where, full_disk)
+            return super()._on_step()
+
+    with pytest.warns(
+        UserWarning, match=r"checkpoint-[23]0 could not be written \(.*No space left on device\)"
+    ) as told:
+        model = make_model().learn(30, DiskThatFills(tmp_path, 10))
+    assert len(told) == 2  # at 20 and at 30
+    monkeypatch.undo()
+    assert_same(everything(model), expected)
+    assert names(tmp_path) == ["checkpoint-10"]
+    resumed = load_checkpoint(tmp_path, make_env(), device="cpu").learn(20, reset_num_timesteps=False)
+    assert_same(everything(resumed), expected)
+
+
+def test_disk_that_is_full_at_once_is_an_error_without_callback(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        save_checkpoint(make_model(), tmp_path / "mine")
+    assert names(tmp_path) == []
+
+
+def test_file_and_folder_are_synced_before_and_after_renaming(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+
+    def fsync(handle: int) -> None:
+        done.append("folder" if os.path.isdir(f"/proc/self/fd/{handle}") else "file")
+
+    def replace(source: Path, target: Path) -> None:
+        done.append("renamed")
+        os.rename(source, target)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.setattr(os, "replace", replace)
+    write_archive(tmp_path / "file", {}, memoryview(b"model"), {})
+    assert done == ["file", "renamed", "folder"]
+
+
+def test_large_arrays_take_no_memory_twice(tmp_path: Path) -> None:
+    """On the way out hardly any, on the way in once."""
+    rng, file = np.random.default_rng(0), tmp_path / "file"
+    frames, fortran = rng.integers(0, 256, (8, 1 << 20), np.uint8), np.asfortranarray(rng.random((512, 999)))
+    state = {"frames": frames, "fortran": fortran}
+    total = sum(array.nbytes for array in state.values())
+    peaks = []
+    for act in (lambda: write_archive(file, {}, memoryview(b""), state), lambda: read_archive(file)):
+        tracemalloc.start()
+        result = act()
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert result is not None
+    loaded = result[2]
+    assert_same(leaves(loaded), leaves(state))
+    assert loaded["frames"].flags.writeable and loaded["fortran"].flags.f_contiguous
+    assert peaks[0] < 0.2 * total and peaks[1] < 1.4 * total
+
+
+class Known:
+    """Stands for a class that a script defines."""
+
+
+def test_classes_of_the_script_are_its_own_when_it_runs_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As with pickle; cloudpickle would bring a copy of the class, for which isinstance fails."""
+    main = sys.modules["__main__"]
+    again = type("Known", (), {"__module__": "__main__"})
+    monkeypatch.setattr(Known, "__module__", "__main__")
+    monkeypatch.setattr(main, "Known", Known, raising=False)
+    pickled = dumps([Known(), lambda: 3])
+    monkeypatch.setattr(main, "Known", again)
+    known, function = loads(pickled)
+    assert type(known) is again and function() == 3
+
+
+def test_objects_that_exist_are_not_pickled() -> None:
+    owner = th.nn.Linear(1, 1)
+    pickled = dumps({"owner": owner, "others": [owner]}, [warnings, owner])
+    other = th.nn.Linear(1, 1)
+    assert loads(pickled, [None, other]) == {"owner": other, "others": [other]}
