@@ -4,8 +4,10 @@ from pathlib import Path
 
 from sb3_have import envs as envs  # registers the environments
 from sb3_have.common.buffers import ModalityReplayBuffer
+from sb3_have.common.checkpoint import ResumableCheckpointCallback, load_checkpoint, save_checkpoint
 from sb3_have.common.evaluation import evaluate
-from sb3_have.have import HAVESAC, DeepMDPCallback, MultiModalCritic, MultiModalPolicy
+from sb3_have.export import export_onnx, export_safetensors, load_policy
+from sb3_have.have import HAVESAC, DeepMDPCallback, ModalityWeightsCallback, MultiModalCritic, MultiModalPolicy
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 
@@ -13,8 +15,15 @@ __all__ = [
     "HAVESAC",
     "DeepMDPCallback",
     "ModalityReplayBuffer",
+    "ModalityWeightsCallback",
     "MultiModalCritic",
     "MultiModalPolicy",
+    "ResumableCheckpointCallback",
     "__version__",
     "evaluate",
+    "export_onnx",
+    "export_safetensors",
+    "load_checkpoint",
+    "load_policy",
+    "save_checkpoint",
 ]
