@@ -1,5 +1,6 @@
 """The documentation site: `make docs`, or `python -m sphinx -W --keep-going -b html docs docs/_build/html`."""
 
+import re
 from typing import Any
 
 from sb3_have import __version__
@@ -26,20 +27,27 @@ autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True, "show-inheritance": True}
 autodoc_inherit_docstrings = False
 
-# What lies outside of docs is linked as it lies, so that the pages read well on their own, and is a page here
+# Pages link to what lies outside of docs as it lies, so that they read well on their own. Some of that is a page here,
+# by inclusion; what else the included texts link to is only named.
 RECORDS = {
     "../benchmarks/STUDY.md": "records/study.md",
     "../benchmarks/results/study_quick/faults.md": "records/faults.md",
     "results/reliability/design.md": "design.md",
 }
+LOCAL_LINK = re.compile(r"(?<!!)\[([^\]]+)\]\((?!\w+:|#)([^)]+)\)")
 
 
-def to_records(text: str) -> str:
-    for file, page in RECORDS.items():
-        text = text.replace(f"]({file})", f"]({page})")
-    return text
+def link_records(app: Any, page: str, source: list[str]) -> None:
+    for file, record in RECORDS.items():
+        source[0] = source[0].replace(f"]({file})", f"]({record})")
+
+
+def link_within_records(app: Any, path: Any, page: str, source: list[str]) -> None:
+    source[0] = LOCAL_LINK.sub(
+        lambda link: f"[{link[1]}]({RECORDS[link[2]]})" if link[2] in RECORDS else link[1], source[0]
+    )
 
 
 def setup(app: Any) -> None:
-    app.connect("source-read", lambda app, page, source: source.insert(0, to_records(source.pop())))
-    app.connect("include-read", lambda app, path, page, source: source.insert(0, to_records(source.pop())))
+    app.connect("source-read", link_records)
+    app.connect("include-read", link_within_records)

@@ -43,7 +43,7 @@ def export_onnx(
 
     The inputs are named by the observation keys ("observation" for a Box) and take what the policy reads: batches of
     any size, images as uint8 (B, C, H, W), which is to say what VecFrameStack and VecTransposeImage make of the
-    environment's, others in the type of their space. The outputs are ``action``, float32 (B, *action shape), as
+    environment's, others in the type of their space. The outputs are ``action``, float32 ``(B, *action shape)``, as
     ``predict(deterministic=True)`` gives it, and, where the policy has weights of modalities (HAVESAC with
     ``value_estimation`` "have" or "lve"), ``weights``, float32 (B, d)::
 
