@@ -20,7 +20,7 @@ from sb3_have.plotting import (
 )
 
 T = 4
-WEIGHTS = {"rgb": np.array([0.1, 0.2, 0.3, 0.4]), "depth": np.array([0.9, 0.8, 0.7, 0.6])}
+WEIGHTS = {"depth": np.array([0.9, 0.8, 0.7, 0.6]), "rgb": np.array([0.1, 0.2, 0.3, 0.4])}  # not the order of pictures
 VALUES = {
     "q": np.array([[1.0, 5.0, 3.0, 0.0], [2.0, 4.0, 3.5, -1.0]]),
     "q_global": np.arange(8.0).reshape(2, T),
@@ -50,8 +50,8 @@ def test_decomposition_shows_the_parts_of_the_twin_that_acts() -> None:
     np.testing.assert_allclose(drawn["H, re-fusion of both"], [1, 4, 3, -1])
     np.testing.assert_allclose(drawn["global"], VALUES["q_global"][TWINS, NOW])
     np.testing.assert_allclose(drawn["weighted local"], VALUES["q_lve"][TWINS, NOW])
-    np.testing.assert_allclose(drawn["local: rgb"], VALUES["q_local"][TWINS, 0, NOW])
-    np.testing.assert_allclose(drawn["local: depth"], VALUES["q_local"][TWINS, 1, NOW])
+    np.testing.assert_allclose(drawn["local: rgb"], VALUES["q_local"][TWINS, 1, NOW])
+    np.testing.assert_allclose(drawn["local: depth"], VALUES["q_local"][TWINS, 0, NOW])
     np.testing.assert_allclose(drawn["return that came"], [2.0, 2.0, 4.0, 4.0])
     np.testing.assert_allclose(lines(weights)["depth"], WEIGHTS["depth"])
     np.testing.assert_allclose(lines(reward)["reward"], [1, 0, 2, 4])
