@@ -12,6 +12,7 @@ import torch as th
 import yaml
 from fake_drive import CONFIG, ENV_ID
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
+from stable_baselines3.common.monitor import Monitor
 
 from sb3_have import ModalityReplayBuffer, MultiModalPolicy, train
 from sb3_have.common.drivers import RandomDriver
@@ -172,7 +173,10 @@ def test_training_and_its_evaluations_are_wrapped(tmp_path: Path) -> None:
     assert len(monitored) == 6 and all(row.split(",")[1] == "2" for row in monitored)
     assert ",2.0," in (tmp_path / "evaluation.csv").read_text()
     env = train.make_training_env(ENV_ID, config)
-    assert isinstance(env.unwrapped.envs[0].env, TimeLimit)  # type: ignore[attr-defined]
+    monitor: Any = env.unwrapped.envs[0]  # type: ignore[attr-defined]
+    while not isinstance(monitor, Monitor):
+        monitor = monitor.env
+    assert isinstance(monitor.env, TimeLimit)
     env.close()
 
 
