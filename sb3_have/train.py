@@ -13,20 +13,15 @@ from __future__ import annotations
 import argparse
 import io
 import json
-import signal
-import threading
-import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import gymnasium as gym
 import pandas as pd
 from sb3_contrib import TQC
 from stable_baselines3 import SAC
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -51,6 +46,8 @@ from sb3_have.common.files import locked, write_atomically
 from sb3_have.common.memory import keep_freed_memory
 from sb3_have.configuration import env_wrapper, evaluation_env_kwargs, hyperparameter, load_config, model_kwargs
 from sb3_have.envs.weather import WEATHERS
+from sb3_have.run_callback import RunCallback as RunCallback
+from sb3_have.run_callback import TrainingStopped, is_due
 
 EVALUATION_SEED = 1_000_000
 """Of the episodes that evaluate a run while it trains: the same for all runs."""
@@ -96,79 +93,6 @@ def make_training_env(env_id: str, config: Mapping[str, Any], out: Path | None =
     makers: list[Callable[[], gym.Env[Any, Any]]] = [partial(make, index) for index in range(n_envs)]
     vec_env: VecEnv = SubprocVecEnv(makers) if n_envs > 1 else DummyVecEnv(makers)
     return VecFrameStack(vec_env, config["frame_stack"]) if config.get("frame_stack", 1) > 1 else vec_env
-
-
-class TrainingStopped(Exception):
-    """Ends ``learn`` between two rollouts; a callback's False would lose the transition it has just made."""
-
-
-def is_due(frequency: int, step: int, last_step: int) -> bool:
-    """Whether a multiple of a frequency, 0 for never, lies between two steps; rollouts go several steps at a time."""
-    return frequency > 0 and step // frequency > last_step // frequency
-
-
-class RunCallback(BaseCallback):
-    """Evaluates and saves a run as it goes, and ends it in good order on Ctrl-C, SIGTERM or a time limit.
-
-    :param run: what to evaluate and where to save
-    """
-
-    def __init__(self, run: Run) -> None:
-        super().__init__()
-        self.run = run
-        self.stopping = False
-        self._in_evaluation = False
-        self._handlers: dict[int, Any] = {}
-
-    def _on_training_start(self) -> None:
-        self._started, self._earlier = time.monotonic(), self.run.seconds
-        self._first_step = self._last_step = self.model.num_timesteps
-        # SB3 finishes the rollout it is in and the updates, so that buffer and optimizers stay whole
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                self._handlers[number] = signal.signal(number, self._stop)
-
-    def _stop(self, number: int, frame: FrameType | None) -> None:
-        if self.stopping or self._in_evaluation:
-            self.stopping = True
-            raise KeyboardInterrupt
-        self.stopping = True
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_start(self) -> None:
-        if self.model.num_timesteps == self._first_step:
-            return
-        self._evaluate_and_save(rollout_started=True)
-        limit = self.run.time_limit
-        if self.stopping or (limit is not None and time.monotonic() - self._started > limit):
-            self.locals["callback"].on_training_end()  # closes the progress bar
-            raise TrainingStopped
-
-    def _on_training_end(self) -> None:
-        self._evaluate_and_save(rollout_started=False)
-
-    def _evaluate_and_save(self, rollout_started: bool) -> None:
-        """Between rollouts, where nothing is pending: a run that goes on from here misses nothing."""
-        run, step = self.run, self.model.num_timesteps
-        run.seconds = self._earlier + time.monotonic() - self._started
-        # an evaluation that a stop prevents is made up for when the run goes on
-        if not self.stopping:
-            self._in_evaluation = True
-            try:
-                run.evaluate_if_due(self.model)
-            except KeyboardInterrupt:
-                self.stopping = True
-            self._in_evaluation = False
-        if is_due(run.save_freq, step, self._last_step):
-            run.save(self.model, rollout_started)
-        self._last_step = step
-
-    def restore_handlers(self) -> None:
-        """Give the signals back to whoever had them."""
-        for number, handler in self._handlers.items():
-            signal.signal(number, handler)
 
 
 class Run:
@@ -258,6 +182,7 @@ class Run:
 
     def _learn(self, model: OffPolicyAlgorithm, steps: int, progress_bar: bool) -> None:
         done = model.num_timesteps
+        self._rollout_started = self._in_mid_rollout = False
         callback, logger = RunCallback(self), configure(str(self.out / f"log-{done}"), ["csv"])
         model.set_logger(logger)
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -115,5 +116,6 @@ class Drifting(gym.Env[np.ndarray, np.ndarray]):
         self.steps += 1
         self.point = 0.8 * self.point + 0.1 * action + 0.1 * self.np_random.normal(size=2) + 0.1 * np.random.rand()
         self.point += 0.1 * self.action_space.sample()  # the same generator as the model's, in one process
+        self.point += 0.1 * random.random()
         over = self.steps == self.length
         return self.point.astype(np.float32), -float(np.square(self.point).sum()), False, over, {}

@@ -2,16 +2,19 @@
 
 import fcntl
 import os
+import random
 import signal
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import pytest
 import torch as th
 import yaml
 from fake_drive import CONFIG, ENV_ID
+from resuming import assert_same, everything, leaves
 
 import sb3_have
 from sb3_have import train
@@ -69,6 +72,57 @@ def test_incomplete_checkpoint_is_ignored(tmp_path: Path) -> None:
     assert newest_checkpoint(tmp_path) is None
     make_run(tmp_path, eval_freq=0).train(8)
     assert [path.name for path in tmp_path.glob("checkpoint*")] == ["checkpoint-8"]
+
+
+def outcome(run: Run, model: Any) -> dict[str, Any]:
+    """All that a run leaves, but for times."""
+    evaluations = pd.read_csv(run.out / "evaluation.csv").drop(columns="wall_time")
+    episodes = pd.read_csv(run.out / "monitor.csv", skiprows=1).drop(columns="t")
+    return everything(model) | leaves({"evaluations": evaluations.to_numpy(), "episodes": episodes.to_numpy()})
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    run = make_run(tmp_path_factory.mktemp("uninterrupted"))
+    return outcome(run, run.train(40))
+
+
+@pytest.mark.parametrize("n_signals", [0, 1, 2], ids=["killed", "stopped", "stopped at once"])
+def test_resumed_run_is_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, uninterrupted: dict[str, Any], n_signals: int
+) -> None:
+    """Bit for bit, evaluations and all."""
+
+    class Interrupted(train.RunCallback):
+        def _on_step(self) -> bool:
+            for _ in range(n_signals if self.num_timesteps == 25 else 0):
+                os.kill(os.getpid(), signal.SIGINT)
+            return super()._on_step()
+
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "RunCallback", Interrupted)
+        run = make_run(tmp_path, save_freq=10)
+        run.train(28, keep_checkpoint=n_signals > 0)
+    assert run.interrupted == (n_signals > 0)
+    assert newest_checkpoint(tmp_path) == tmp_path / ("checkpoint-25" if n_signals == 1 else "checkpoint-20")
+    assert (tmp_path / "model.zip").exists() == (n_signals < 2)
+    again = make_run(tmp_path)
+    assert_same(outcome(again, again.train(40)), uninterrupted)
+
+
+def test_evaluations_do_not_disturb(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, uninterrupted: dict[str, Any]
+) -> None:
+    def evaluate(*args: Any, **kwargs: Any) -> pd.DataFrame:
+        random.random(), np.random.rand(3), th.rand(3)
+        return sb3_have.evaluate(*args, **kwargs)
+
+    monkeypatch.setattr(train, "evaluate", evaluate)
+    run = make_run(tmp_path, eval_freq=3)
+    model = run.train(40)
+    assert len(pd.read_csv(tmp_path / "evaluation.csv")) == 2 * 13
+    states = outcome(run, model), uninterrupted
+    assert_same(*({name: leaf for name, leaf in state.items() if name != "/evaluations"} for state in states))
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
