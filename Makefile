@@ -3,11 +3,11 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 INSTALLED = $(VENV)/.installed
-SOURCES = sb3_have tests benchmarks
+SOURCES = sb3_have tests benchmarks notebooks
 # One torch thread a process: the two test processes would otherwise fight over the cores.
 PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
-.PHONY: demo study-quick test lint format type commit-checks install clean
+.PHONY: demo study-quick test docs lint format type commit-checks install clean
 
 demo: $(INSTALLED)
 	$(BIN)/python -m sb3_have.demo
@@ -22,6 +22,9 @@ test: $(INSTALLED)
 lint: $(INSTALLED)
 	$(BIN)/ruff check $(SOURCES)
 	$(BIN)/ruff format --check $(SOURCES)
+
+docs: $(INSTALLED)
+	$(BIN)/python -m sphinx -W --keep-going -b html docs docs/_build/html
 
 format: $(INSTALLED)
 	$(BIN)/ruff check --fix $(SOURCES)
@@ -42,5 +45,5 @@ $(INSTALLED): setup.cfg pyproject.toml constraints.txt
 	@touch $@
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .mypy_cache .pytest_cache .ruff_cache
+	rm -rf $(VENV) build dist docs/_build *.egg-info .mypy_cache .pytest_cache .ruff_cache
 	find $(SOURCES) -type d -name __pycache__ -prune -exec rm -rf {} +
