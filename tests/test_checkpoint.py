@@ -65,6 +65,7 @@ def noise(size: int) -> OrnsteinUhlenbeckActionNoise:
 
 CASES: dict[str, tuple[Any, Any]] = {
     "every step": (sac, drifting),
+    "within the warm-up": (partial(sac, learning_starts=30), drifting),
     "every 2nd step of 2": (partial(sac, train_freq=2, gradient_steps=2), partial(drifting, 2)),
     "every episode": (partial(sac, train_freq=(1, "episode")), pendulum),
     "normalized": (sac, normalized),
@@ -114,13 +115,42 @@ def test_schedules_go_on(tmp_path: Path) -> None:
     assert isinstance(model, HAVESAC) and model.auxiliary_coefs["transition"] < 0.01
 
 
-def test_worker_processes(tmp_path: Path) -> None:
+@pytest.fixture
+def warm_workers() -> None:
+    """Worker processes import what they need once for all."""
     multiprocessing.get_context("forkserver").set_forkserver_preload(["resuming", "sb3_have.common.env_state"])
 
+
+@pytest.mark.usefixtures("warm_workers")
+def test_worker_processes(tmp_path: Path) -> None:
     def make_env() -> VecEnv:
         return VecNormalize(SubprocVecEnv([lambda: ResumableEnv(Monitor(Drifting()))] * 2))
 
     assert_resumes(tmp_path, sac, make_env, 23, 40)
+
+
+@pytest.mark.usefixtures("warm_workers")
+def test_worker_processes_out_of_reach(tmp_path: Path) -> None:
+    """Without ResumableEnv the episodes begin anew, from the same random numbers."""
+    model = sac(SubprocVecEnv([Drifting] * 2)).learn(12)
+    with pytest.warns(UserWarning, match=r"SubprocVecEnv that are not wrapped in .*ResumableEnv\..* begin anew"):
+        save_checkpoint(model, tmp_path / "mine")
+    resumed = load_checkpoint(tmp_path / "mine", SubprocVecEnv([Drifting] * 2), device="cpu")
+    assert resumed._last_obs is None
+    assert np.array_equal(resumed.env.reset(), model.env.reset())
+    for one in (model, resumed):
+        one.env.close()
+
+
+def test_training_that_a_callback_ends(tmp_path: Path) -> None:
+    """Its last transition is nowhere, so there is no checkpoint of that step."""
+
+    class Ends(BaseCallback):
+        def _on_step(self) -> bool:
+            return self.num_timesteps < 25
+
+    sac(drifting()).learn(40, [ResumableCheckpointCallback(tmp_path, 10), Ends()])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint-10", "checkpoint-20"]
 
 
 def test_saving_does_not_disturb(tmp_path: Path) -> None:
