@@ -70,7 +70,8 @@ CASES: dict[str, tuple[Any, Any]] = {
     "every episode": (partial(sac, train_freq=(1, "episode")), pendulum),
     "normalized": (sac, normalized),
     "normalized, 2": (sac, partial(normalized, 2)),
-    "gSDE": (partial(sac, use_sde=True, sde_sample_freq=3, train_freq=2), partial(drifting, 2)),
+    "gSDE": (partial(sac, use_sde=True, train_freq=2), partial(drifting, 2)),
+    "gSDE, drawn more often": (partial(sac, use_sde=True, sde_sample_freq=3, train_freq=5), drifting),
     "overlapping observations": (
         partial(sac, optimize_memory_usage=True, replay_buffer_kwargs={"handle_timeout_termination": False}),
         drifting,

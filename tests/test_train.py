@@ -1,6 +1,7 @@
 """Training runs: resumed where they were, evaluations neither lost nor doubled, stopped in good order."""
 
 import fcntl
+import multiprocessing
 import os
 import random
 import signal
@@ -217,10 +218,14 @@ def test_time_limit(tmp_path: Path) -> None:
 
 
 def test_several_environments(tmp_path: Path) -> None:
-    run = Run({**CONFIG, "n_envs": 2}, ENV_ID, tmp_path, algo="sac", eval_freq=15, eval_episodes=1, weathers=["slow"])
-    assert run.train(30).num_timesteps == 30
+    multiprocessing.get_context("forkserver").set_forkserver_preload(["sb3_have.train"])
+    kwargs: dict[str, Any] = {"algo": "sac", "eval_freq": 15, "eval_episodes": 1, "weathers": ["slow"]}
+    for steps in (20, 30):
+        assert Run({**CONFIG, "n_envs": 2}, ENV_ID, tmp_path, **kwargs).train(steps).num_timesteps == steps
     # a step counts two, so 15 is passed at 16
     assert list(pd.read_csv(tmp_path / "evaluation.csv")["step"]) == [16, 30]
+    for file in tmp_path.glob("*.monitor.csv"):
+        assert 15 - 8 < pd.read_csv(file, skiprows=1)["l"].sum() <= 15, "episodes go on where they were"
     assert len(list(tmp_path.glob("*.monitor.csv"))) == 2
 
 
