@@ -62,7 +62,9 @@ def test_runs(path: Path, kernel: KernelManager) -> None:
         assert client.kc is not None
         client.kc.stop_channels()  # its sockets; nbclient leaves them open where the kernel is not its own
     outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
-    assert any("image/png" in output.get("data", {}) for output in outputs)
+    shown = [output["data"] for output in outputs if "data" in output]
+    figures = [data for data in shown if data.get("text/plain", "").startswith("<Figure")]
+    assert figures and all("image/png" in data for data in figures)
 
 
 @each
