@@ -30,8 +30,8 @@ from sb3_have.sensors import EVENT_DTYPE, write_events
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 REASONS = ("needs a CARLA server", "needs an account of W&B", "needs a PostgreSQL server")
-STEPS, BATCH_SIZE = 110, 8
-"""Most steps of a ``learn``, and samples of a batch: SB3 begins to learn after 100 steps by default."""
+STEPS, LEARNING_STARTS, BATCH_SIZE = 60, 50, 8
+"""Most steps of a ``learn``, of these before the first update, and samples of an update's batch."""
 FENCE = re.compile(r"^(?P<indent> *)(?P<fence>`{3,}|:{3,})(?P<info>[^`\n]*)\n(?P<body>.*?)^\1\2 *$", re.S | re.M)
 
 
@@ -74,6 +74,7 @@ def small_budget(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[No
 
     def learn_little(model: OffPolicyAlgorithm, total_timesteps: int, *args: Any, **kwargs: Any) -> OffPolicyAlgorithm:
         model.batch_size = min(model.batch_size, BATCH_SIZE)
+        model.learning_starts = min(model.learning_starts, LEARNING_STARTS)
         return learn(model, min(total_timesteps, STEPS), *args, **kwargs)  # type: ignore[no-any-return]
 
     monkeypatch.setattr(OffPolicyAlgorithm, "learn", learn_little)
@@ -105,7 +106,8 @@ def test_python_blocks_run(page: Path, small_budget: None, tmp_path: Path) -> No
     python = [block for block in blocks(page) if block.language == "python" and block.reason is None]
     if any("MUJOCO_GL" in block.text for block in python) and (reason := missing_for_mujoco()):
         pytest.skip(reason)
-    PREPARATIONS.get(name_of(page), lambda folder: None)(tmp_path)
+    if prepare := PREPARATIONS.get(name_of(page)):
+        prepare(tmp_path)
     namespace: dict[str, Any] = {"__name__": "__main__"}
     for block in python:
         exec(compile("\n" * block.line + block.text, str(page), "exec"), namespace)
