@@ -12,7 +12,6 @@ from envs import RandomSensors
 from gymnasium import spaces
 
 from sb3_have import MultiModalPolicy
-from sb3_have.export import modality_weights
 
 Observations = dict[str, np.ndarray]
 N_OBSERVATIONS = 1000
@@ -60,7 +59,7 @@ def assert_parity(path: Path, policy: Any) -> None:
     # constants would agree too
     assert (expected.std(axis=0) > 1e-3).all(), expected.std(axis=0)
     if isinstance(policy, MultiModalPolicy) and policy.critic.value_estimation != "gve":
-        weights = np.stack(list(modality_weights(policy, raw).values()), axis=1)
+        weights = np.stack(list(policy.modality_weights(raw).values()), axis=1)
         np.testing.assert_allclose(outputs["weights"], weights, rtol=0, atol=1e-4)
         assert (weights.std(axis=0) > 1e-3).all(), weights.std(axis=0)
     else:

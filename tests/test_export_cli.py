@@ -66,6 +66,10 @@ def test_wrong_files(tmp_path: Path, zipped: Path) -> None:
     assert "ppo.zip: its policy is of stable_baselines3.common.policies, and only" in run(
         tmp_path / "ppo.zip", *to_onnx
     )
+    assert "model.zip: its policy is of havesac, not of tqc" in run(zipped, *to_onnx, "--algo", "tqc")
+    with zipfile.ZipFile(zipped) as archive, zipfile.ZipFile(tmp_path / "half.zip", "w") as half:
+        half.writestr("data", archive.read("data"))
+    assert "half.zip cannot be loaded: KeyError" in run(tmp_path / "half.zip", *to_onnx)
     assert "expected the name of a folder" in run(zipped, "--format", "safetensors", "--out", zipped)
     assert not (tmp_path / "out").exists()
 

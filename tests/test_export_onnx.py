@@ -98,12 +98,13 @@ def test_vectors_and_modalities_of_several_keys(tmp_path: Path) -> None:
 def test_a_single_image(tmp_path: Path) -> None:
     model = tiny_model(image(2, 16), value_estimation="gve")
     enliven(model.policy)
-    path = tmp_path / "policy.onnx"
+    path = tmp_path / "new" / "policy.onnx"
+    export_onnx(model, path)
     path.write_bytes(b"an older file")
     export_onnx(model, path)
     assert_parity(path, model.policy)
     assert input_types(path) == {"observation": ("tensor(uint8)", ["batch", 2, 16, 16])}
-    assert [file.name for file in tmp_path.iterdir()] == ["policy.onnx"]
+    assert [file.name for file in path.parent.iterdir()] == ["policy.onnx"]
 
 
 class Contrary(sb3_have.MultiModalPolicy):
@@ -126,6 +127,8 @@ def test_what_is_refused_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         export_onnx(model, tmp_path / "policy.onnx")
     with pytest.raises(ValueError, match=r"expected a model or policy of HAVESAC, .* got str"):
         export_onnx("model.zip", tmp_path / "policy.onnx")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="is a folder, expected the name of a file"):
+        export_onnx(model, tmp_path)
     monkeypatch.setitem(sys.modules, "onnxscript", None)
     with pytest.raises(ImportError, match=r'onnxscript is needed to export policies: pip install "sb3_have\[export\]"'):
         export_onnx(model, tmp_path / "policy.onnx")

@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNorm
 from sb3_have import MultiModalPolicy
 from sb3_have.common.crossq import MultiInputCrossQ
 from sb3_have.common.encoders import MultiModalExtractor, VectorEncoder
-from sb3_have.export import export_safetensors, load_policy, modality_weights, read_config
+from sb3_have.export import export_safetensors, load_policy, read_config
 
 
 class Normed(th.nn.Sequential):
@@ -72,7 +72,7 @@ def assert_same_policy(model: Any, policy: Any) -> None:
         parts, others = (one.critic.decompose(obs, action) for one in (model.policy, policy))
         assert parts.keys() == others.keys() and all(th.equal(parts[name], others[name]) for name in parts)
         if policy.critic.value_estimation != "gve":
-            weights, expected = modality_weights(policy, observation), model.modality_weights(observation)
+            weights, expected = policy.modality_weights(observation), model.modality_weights(observation)
             assert list(weights) == list(expected)
             assert all(np.array_equal(weights[name], expected[name]) for name in weights)
 

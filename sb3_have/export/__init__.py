@@ -9,6 +9,6 @@ What it needs comes with ``pip install "sb3_have[export]"``.
 """
 
 from sb3_have.export.onnx import export_onnx
-from sb3_have.export.safetensors import export_safetensors, load_policy, modality_weights, read_config
+from sb3_have.export.safetensors import export_safetensors, load_policy, read_config
 
-__all__ = ["export_onnx", "export_safetensors", "load_policy", "modality_weights", "read_config"]
+__all__ = ["export_onnx", "export_safetensors", "load_policy", "read_config"]

@@ -24,12 +24,13 @@ from sb3_have.export.safetensors import CONFIG_FILE, export_safetensors, load_po
 from sb3_have.train import algorithms
 
 MODULES = {
+    "sb3_have.have": "havesac",
     "sb3_have.common.crossq": "crossq",
     "sb3_contrib.crossq": "crossq",
     "sb3_contrib.tqc": "tqc",
     "stable_baselines3.sac": "sac",
 }
-"""Algorithms by the module of their policies; all others are taken for HAVESAC's, whose policies users subclass."""
+"""Algorithms by the module of their policies; a policy of a user's is taken for a subclass of HAVESAC's."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -83,10 +84,15 @@ def load_zip(path: Path, algo: str | None = None) -> BaseAlgorithm:
             f"{path}: not a model that SB3 saved by `model.save(path)` ({error}); a checkpoint's folder has one in "
             "its model.zip"
         ) from error
-    found = next((name for prefix, name in MODULES.items() if module.startswith(prefix)), "havesac")
-    if algo is None and found == "havesac" and module.startswith(("stable_baselines3.", "sb3_contrib.")):
+    found = next((name for prefix, name in MODULES.items() if module.startswith(prefix)), None)
+    if found is None and module.startswith(("stable_baselines3.", "sb3_contrib.")):
         raise ValueError(f"{path}: its policy is of {module}, and only {', '.join(algorithms())} can be exported")
-    return algorithms()[algo or found].load(path, device="cpu", buffer_size=1)
+    if algo is not None and found not in (None, algo):
+        raise ValueError(f"{path}: its policy is of {found}, not of {algo}: leave out --algo")
+    try:
+        return algorithms()[algo or found or "havesac"].load(path, device="cpu", buffer_size=1)
+    except Exception as error:  # whatever pickle makes of a damaged file
+        raise ValueError(f"{path} cannot be loaded: {type(error).__name__}: {error}") from error
 
 
 if __name__ == "__main__":

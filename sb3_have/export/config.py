@@ -68,6 +68,8 @@ CLASSES: dict[str, type[Any]] = {
 NAMES = {kind: name for name, kind in CLASSES.items()}
 NON_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 DTYPES = ("float16", "float32", "float64", "uint8", "uint16", "uint32", "int8", "int16", "int32", "int64")
+MAX_SIZE = 10**8
+"""Values of a space, so that a file does not take all memory by a shape; an image of 4K has 2.5e7."""
 _ABSENT = object()
 
 
@@ -166,9 +168,12 @@ def build(
         raise ValueError(
             f"{path}: policy_class is {kind!r}, expected a policy of {[base.__name__ for base in FAMILIES]}."
         )
-    kwargs = from_json(config["policy_kwargs"], policy_kwargs or {}, path, "policy_kwargs", ())
-    observation_space = space_from_json(config["observation_space"], path, "observation_space")
-    action_space = space_from_json(config["action_space"], path, "action_space")
+    try:
+        kwargs = from_json(config["policy_kwargs"], policy_kwargs or {}, path, "policy_kwargs", ())
+        observation_space = space_from_json(config["observation_space"], path, "observation_space")
+        action_space = space_from_json(config["action_space"], path, "action_space")
+    except RecursionError as error:
+        raise ValueError(f"{path}: nested too deep; export the policy again.") from error
     try:
         policy: BasePolicy = kind(observation_space, action_space, _no_schedule, **kwargs)  # type: ignore[arg-type]
     except Exception as error:  # whatever a damaged file makes of the arguments
@@ -293,9 +298,11 @@ def space_from_json(value: Any, path: Path, where: str) -> spaces.Space[Any]:
         if value["type"] != "Box" or value["dtype"] not in DTYPES:
             raise ValueError(f"type {value['type']!r} of dtype {value.get('dtype')!r}, expected a Box of a NumPy type")
         shape, dtype = tuple(value["shape"]), np.dtype(value["dtype"])
+        if math.prod(shape) > MAX_SIZE:
+            raise ValueError(f"shape {shape} has more than {MAX_SIZE} values")
         low, high = (np.asarray(from_json(value[name], _ABSENT, path, where, ()), dtype) for name in ("low", "high"))
         return spaces.Box(np.broadcast_to(low, shape), np.broadcast_to(high, shape), shape, dtype.type)
-    except (AssertionError, AttributeError, KeyError, OverflowError, TypeError, ValueError) as error:
+    except (AssertionError, AttributeError, KeyError, MemoryError, OverflowError, TypeError, ValueError) as error:
         if str(path) in str(error):
             raise
         raise ValueError(f"{path}: {where} is damaged: {error}; export the policy again.") from error

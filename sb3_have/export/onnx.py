@@ -64,7 +64,9 @@ def export_onnx(
     """
     for name in ("onnx", "onnxscript", "onnxruntime"):
         require(name)
-    policy = policy_of(model)
+    policy, path = policy_of(model), Path(path)
+    if path.is_dir():
+        raise ValueError(f"{path} is a folder, expected the name of a file, such as {path / 'policy.onnx'}.")
     space = policy.observation_space
     if isinstance(space, spaces.Dict) and (taken := [key for key in space.spaces if key in OUTPUTS]):
         raise ValueError(f"observation key {taken[0]!r} is the name of an output of the file; rename the key.")
@@ -86,7 +88,8 @@ def export_onnx(
         onnx.checker.check_model(proto, full_check=True)
         content = proto.SerializeToString()
         _check_parity(content, policy)
-    write_atomically(Path(path), partial(Path.write_bytes, data=content))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, partial(Path.write_bytes, data=content))
 
 
 class Network(nn.Module):

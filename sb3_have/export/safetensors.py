@@ -20,7 +20,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
@@ -29,7 +28,6 @@ from stable_baselines3.common.utils import get_device
 from sb3_have.common.files import write_atomically
 from sb3_have.export.config import build, describe, policy_of, warn_of_normalization
 from sb3_have.export.requirements import require
-from sb3_have.have.policies import MultiModalPolicy
 
 CONFIG_FILE, WEIGHTS_FILE = "config.json", "model.safetensors"
 MAX_HEADER_SIZE = 100_000_000
@@ -90,7 +88,7 @@ def load_policy(
 ) -> BasePolicy:
     """
     A policy written by :func:`export_safetensors`, ready for ``predict``: a :class:`~sb3_have.MultiModalPolicy` for
-    HAVESAC, with ``critic.decompose``, and for :func:`modality_weights`.
+    HAVESAC, with its ``modality_weights`` and ``critic.decompose``.
 
     Nothing in the folder is executed: no pickle is read and nothing is imported by a name in a file. Classes come from
     a closed list, SB3's and this package's; others, such as an encoder of your own, are given in the call::
@@ -148,24 +146,6 @@ def read_config(path: str | os.PathLike[str]) -> dict[str, Any]:
     :raises ValueError: if it cannot be read
     """
     return _read_config(Path(path))[0]
-
-
-def modality_weights(
-    policy: MultiModalPolicy, observation: np.ndarray | dict[str, np.ndarray]
-) -> dict[str, np.ndarray]:
-    """
-    The attention weights of the modalities (Eq. 9), which sum to 1, as ``HAVESAC.modality_weights`` gives them.
-
-    :param policy: of HAVESAC
-    :param observation: one observation or a batch, as for ``predict``
-    :return: an array (B,) for each modality
-    :raises ValueError: with ``value_estimation="gve"``, which has no weights
-    """
-    policy.set_training_mode(False)
-    obs, _ = policy.obs_to_tensor(observation)
-    with th.no_grad():
-        weights = policy.critic.weights(policy.encode(obs)).cpu().numpy()
-    return dict(zip(policy.critic.encoder.modalities, weights.T, strict=True))
 
 
 def _read_config(folder: Path) -> tuple[dict[str, Any], str]:

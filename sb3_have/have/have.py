@@ -343,11 +343,7 @@ class HAVESAC(SensorSAC):
         :return: an array (B,) for each modality
         :raises ValueError: with ``value_estimation="gve"``, which has no weights
         """
-        self.policy.set_training_mode(False)
-        obs, _ = self.policy.obs_to_tensor(observation)
-        with th.no_grad():
-            weights = self.critic.weights(self.policy.encode(obs)).cpu().numpy()
-        return dict(zip(self.critic.encoder.modalities, weights.T, strict=True))
+        return self.policy.modality_weights(observation)
 
     def learn(
         self: SelfHAVESAC,

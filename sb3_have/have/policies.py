@@ -183,6 +183,20 @@ class MultiModalPolicy(SACPolicy):
         """Features (B, d, F) of raw observations (as tensors, with batch dimension)."""
         return self.critic.encoder(obs)  # type: ignore[no-any-return]
 
+    def modality_weights(self, observation: np.ndarray | dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """
+        The attention weights of the modalities (Eq. 9), which sum to 1.
+
+        :param observation: one observation or a batch, as for ``predict``
+        :return: an array (B,) for each modality
+        :raises ValueError: with ``value_estimation="gve"``, which has no weights
+        """
+        self.set_training_mode(False)
+        obs, _ = self.obs_to_tensor(observation)
+        with th.no_grad():
+            weights = self.critic.weights(self.encode(obs)).cpu().numpy()
+        return dict(zip(self.critic.encoder.modalities, weights.T, strict=True))
+
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         return self.actor(self.encode(observation).detach().flatten(start_dim=1), deterministic)  # type: ignore[no-any-return]
 
