@@ -149,6 +149,7 @@ def test_weights_over_an_episode(tmp_path: Path) -> None:
     assert (noon.get_title(), night.get_title()) == (NOON, f"{NIGHT}, return 8")
     assert points(line(night, "rgb")) == [(0, 0.2), (1, 0.4)]
     assert points(line(night, "event")) == [(0, 0.8), (1, 0.6)] and points(line(noon, "rgb")) == [(0, 0.9)]
+    assert line(night, "event").get_linestyle() != line(night, "rgb").get_linestyle()
     with pytest.raises(ValueError, match="'lve' with seed 3"):
         figures.plot_episode_weights(results, "lve", 3)
 

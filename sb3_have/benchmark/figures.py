@@ -27,7 +27,7 @@ from sb3_have.plotting.style import (
     draw_levels,
     draw_whiskers,
     legend_above,
-    modality_colours,
+    modality_styles,
 )
 
 WIDTH = 9.0
@@ -244,7 +244,7 @@ def plot_episode_weights(results: Results, method: str, seed: int) -> Figure:
         raise ValueError(f"weights.csv has no weights of {method!r} with seed {seed}")
     weathers = [weather for weather in results.weathers if weather in set(weights["weather"])]
     weathers = weathers or list(dict.fromkeys(weights["weather"]))
-    colours = modality_colours(list(dict.fromkeys(weights["modality"])))
+    styles = modality_styles(dict.fromkeys(weights["modality"]))
     columns = min(4, len(weathers))
     rows = -(-len(weathers) // columns)
     figure = Figure(figsize=(WIDTH, 1.9 * rows + 0.8), layout="constrained")
@@ -252,9 +252,9 @@ def plot_episode_weights(results: Results, method: str, seed: int) -> Figure:
     for axis, weather in zip(axes.flat, weathers, strict=False):
         of_weather = weights[weights["weather"] == weather]
         episode = of_weather[of_weather["episode_seed"] == of_weather["episode_seed"].iloc[0]]
-        for modality, colour in colours.items():
+        for modality, look in styles.items():
             line = episode[episode["modality"] == modality].sort_values("t")
-            axis.plot(line["t"], line["weight"], color=colour, linewidth=1.2, label=modality)
+            axis.plot(line["t"], line["weight"], color=look.colour, linestyle=look.line, linewidth=1.2, label=modality)
         ended = driven[(driven["weather"] == weather) & (driven["episode_seed"] == episode["episode_seed"].iloc[0])]
         told = f", return {ended['return'].iloc[0]:.0f}" if len(ended) else ""
         axis.set_title(f"{weather}{told}", fontsize=SMALL)
@@ -274,7 +274,7 @@ def plot_kept(table: pd.DataFrame, measure: Measure) -> Figure:
     :param table: from :func:`~sb3_have.benchmark.tables.kept_table`
     :param measure: what is kept; the axis shows no more of it than :data:`KEPT`
     """
-    modalities = list(modality_colours(list(set(table["modality"]))))
+    modalities = list(modality_styles(set(table["modality"])))
     methods = ordered(set(table["method"]))
     figure = Figure(figsize=(WIDTH, 2.3 * len(modalities) + 0.9), layout="constrained")
     axes = figure.subplots(len(modalities), 1, sharey=True, squeeze=False)[:, 0]

@@ -1,7 +1,7 @@
 """Pictures of training runs and episodes.
 
 Each function takes data and gives a matplotlib ``Figure`` of its own: a user's pyplot stays untouched. Save one by
-``figure.savefig("name.png", dpi=120)``; a notebook shows it by itself.
+``figure.savefig("name.png", dpi=120)``; a notebook shows it by itself after ``%matplotlib inline``.
 """
 
 from sb3_have.plotting.animation import Frames, write_animation, write_gif

@@ -63,7 +63,8 @@ def plot_decomposition(recording: Recording, gamma: float | None = None, twin: i
 
     :param recording: of a model whose critic has ``decompose``
     :param gamma: discount factor; where given, the discounted sum of the rewards that came is drawn beside the values
-        (which hold an entropy bonus, too, and what would have come after the end of a truncated episode)
+        (which hold an entropy bonus, too, and what would have come after the end of a truncated episode; under
+        ``VecNormalize`` with ``norm_reward`` they are of normalised rewards and cannot be compared)
     :param twin: number of the twin to show; by default, at every instant, the one that acts: the lower H
     :raises ValueError: if the recording has no values, or no such twin
     """

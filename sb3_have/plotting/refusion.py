@@ -86,7 +86,7 @@ def plot_refusion(response: Response) -> Figure:
     filled = axes[0].contourf(response.q_global, response.q_lve, response.h, levels=16, cmap="cividis")
     lines = axes[0].contour(
         *(response.q_global, response.q_lve, response.h),
-        levels=8,
+        levels=filled.levels[::2],  # every second of those that are filled
         colors="white",
         linewidths=0.7,
         negative_linestyles="solid",
