@@ -201,7 +201,7 @@ def main(arguments: list[str] | None = None) -> None:
         sys.exit(130)
     except (OSError, KeyError, ValueError, TypeError, GymnasiumError) as error:
         parser.error(str(error.args[0] if isinstance(error, KeyError) else error))
-    distance = recording.infos[-1].get("distance")
+    distance = recording.end.get("distance")
     told = f", {distance:.0f} m" if distance is not None else ""
     print(f"{args.out}: {len(recording.infos)} steps, return {recording.rewards.sum():.1f}{told}")
 

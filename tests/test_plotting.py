@@ -48,10 +48,13 @@ def test_recording_pairs_what_was_seen_with_its_weights(recording: Recording) ->
     np.testing.assert_allclose(recording.weights["depth"], seen)
     assert [info["distance"] for info in recording.infos] == [2.0 * step for step in range(steps)]
     assert [picture[0, 0, 0] for picture in recording.pictures] == [20 * step for step in range(steps)]
+    end = {"distance": 16.0, "speed": 40.0, "crashed": True, "offroad": False, "TimeLimit.truncated": False}
+    assert recording.end == end
 
 
 def test_recording_stops_at_max_steps() -> None:
-    assert len(record_episode(Weighing(), ENV_ID, "fast", seed=4, max_steps=3).infos) == 3
+    short = record_episode(Weighing(), ENV_ID, "fast", seed=4, max_steps=3)
+    assert len(short.infos) == 3 and short.end["distance"] == 6.0
     assert record_episode(KeepStraightDriver(), ENV_ID, "fast").weights == {}
 
 

@@ -1,6 +1,8 @@
 """Films: as many frames as steps, of the right size, readable back; and what is said of a model that does not fit."""
 
 import builtins
+import weakref
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,7 @@ from stable_baselines3 import PPO, SAC
 
 from sb3_have import HAVESAC, train, watch
 from sb3_have.common.recording import Recording
-from sb3_have.plotting import Frames, write_animation
+from sb3_have.plotting import Frames, animation, write_animation
 from sb3_have.plotting.style import modality_colours
 
 T = 6
@@ -72,10 +74,35 @@ def test_mp4_has_a_frame_a_step_and_is_read_back(library: str, tmp_path: Path, m
     assert [path.name for path in tmp_path.iterdir()] == ["drive.mp4"]
 
 
+def test_frames_of_a_film_are_not_kept_and_a_broken_one_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(animation, "_write_by_ffmpeg", animation._write_by_opencv)
+    drawn: list[weakref.ref[Image.Image]] = []
+
+    def frames(breaks: bool) -> Iterator[Image.Image]:
+        for _ in range(12):
+            assert sum(frame() is not None for frame in drawn) <= 3
+            frame = Image.new("RGB", (120, 80))
+            drawn.append(weakref.ref(frame))
+            yield frame
+        if breaks:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        animation.write_mp4(tmp_path / "drive.mp4", frames(breaks=True), 10.0)
+    assert len(drawn) == 12 and not list(tmp_path.iterdir())
+    animation.write_mp4(tmp_path / "drive.mp4", frames(breaks=False), 10.0)
+    assert [path.name for path in tmp_path.iterdir()] == ["drive.mp4"]
+
+
 def test_gif_has_every_step(tmp_path: Path) -> None:
     write_animation(a_recording(), tmp_path / "drive.gif", width=240)
     with Image.open(tmp_path / "drive.gif") as gif:
         assert (gif.n_frames, gif.width, gif.info["duration"]) == (T, 240, 100)  # type: ignore[attr-defined]
+    write_animation(a_recording(), tmp_path / "fast.gif", fps=125, width=240)
+    with Image.open(tmp_path / "fast.gif") as gif:
+        assert gif.info["duration"] == 20  # less is shown slowly
     with pytest.raises(ValueError, match=r"\.avi: expected"):
         write_animation(a_recording(), tmp_path / "drive.avi")
 
@@ -122,7 +149,7 @@ def test_a_run_tells_its_environment(run: Path, tmp_path: Path, capsys: pytest.C
     with Image.open(out) as gif:
         assert gif.n_frames == 8  # type: ignore[attr-defined]
     told = capsys.readouterr().out
-    assert f"{ENV_ID} {{'weather': 'slow'}}" in told and "8 steps" in told and "7 m" in told
+    assert f"{ENV_ID} {{'weather': 'slow'}}" in told and "8 steps" in told and "8 m" in told
     watch.main([str(run / "model.zip"), "--out", str(out), "--steps", "3", "--env-kwargs", "weather:slow"])
     with Image.open(out) as gif:
         assert gif.n_frames == 3  # type: ignore[attr-defined]

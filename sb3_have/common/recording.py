@@ -31,6 +31,7 @@ class Recording:
     :param pictures: what ``render()`` gave, T uint8 arrays (H, W, 3); none if it does not render
     :param weights: of each modality, (T,); empty if the model has none
     :param infos: T dicts, those before the actions
+    :param end: the info after the last action, which tells the whole distance, a crash or why it ended
     :param actions: (T, A), in the environment's units
     :param rewards: (T,), not normalised; reward t is for action t
     :param values: the critic's parts at what was seen and done, of K twins and d modalities: ``q`` (K, T) and, where
@@ -44,6 +45,7 @@ class Recording:
     pictures: list[np.ndarray] = field(default_factory=list)
     weights: dict[str, np.ndarray] = field(default_factory=dict)
     infos: list[dict[str, Any]] = field(default_factory=list)
+    end: dict[str, Any] = field(default_factory=dict)
     actions: np.ndarray = field(default_factory=lambda: np.empty((0, 0)))
     rewards: np.ndarray = field(default_factory=lambda: np.empty(0))
     values: dict[str, np.ndarray] = field(default_factory=dict)
@@ -141,6 +143,7 @@ def _drive(
         bar.update()
     recording.actions, recording.rewards = np.array(actions), np.array(rewards)
     recording.weights, recording.values = _joined(weights), _joined(values)
+    recording.end = {key: value for key, value in info.items() if key != "terminal_observation"}
     return recording
 
 
