@@ -1,14 +1,12 @@
 """What the tests of ``sb3_have.zoo`` share."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 import yaml
-from gymnasium.wrappers import TimeLimit
+from conftest import TIME_LIMIT_PLACES
 
 VECTORS, DRIVING, CARLA = "ReliabilityDrive-v0", "HighwayVision-v0", "CarlaVision-v0"
 #: A training of 200 steps that still updates everything, some 25 times.
@@ -17,15 +15,11 @@ SMALL_IMAGES = {"image_size": 36, "vehicles_count": 2, "max_episode_steps": 25}
 
 
 @pytest.fixture(scope="module", autouse=True)
-def zoo_patches() -> Iterator[None]:
-    """rl_zoo3 puts a TimeLimit of its own into gymnasium when it is imported; other tests are to have gymnasium's."""
+def zoo_patches() -> None:
+    """rl_zoo3's TimeLimit, which it puts into gymnasium only when it is first imported."""
     rl_zoo3 = pytest.importorskip("rl_zoo3.gym_patches", reason="needs pip install 'sb3_have[zoo]'")
-    places: list[Any] = [gym.wrappers, gym.wrappers.common, gym.envs.registration]
-    for place in places:
+    for place in TIME_LIMIT_PLACES:
         place.TimeLimit = rl_zoo3.PatchedTimeLimit
-    yield
-    for place in places:
-        place.TimeLimit = TimeLimit
 
 
 def saved(folder: Path, name: str) -> dict[str, Any]:
