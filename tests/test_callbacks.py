@@ -180,3 +180,11 @@ def test_bad_arguments() -> None:
     callback = ModalityWeightsCallback(eval_env=env, episode_freq=10)
     with pytest.raises(ValueError, match="trained in"):
         tiny_model(vectors_space(), env=env).learn(1, callback)
+
+
+def test_an_environment_that_does_not_fit_is_refused_before_the_training(tmp_path: Path) -> None:
+    other = RandomSensors(vectors_space(3))
+    model = tiny_model(vectors_space())
+    with pytest.raises(ValueError, match="do not fit the model"):
+        model.learn(50, ModalityWeightsCallback(eval_env=other, episode_freq=1000, folder=tmp_path))
+    assert model.num_timesteps == 0

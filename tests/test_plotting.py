@@ -92,6 +92,8 @@ def test_modality_weights_over_the_episode(recording: Recording) -> None:
 def test_weights_are_needed() -> None:
     with pytest.raises(ValueError, match="modality_weights"):
         plot_modality_weights(record_episode(KeepStraightDriver(), ENV_ID, "fast"))
+    with pytest.raises(ValueError, match="columns=0"):
+        plot_modality_weights(record_episode(Weighing(), ENV_ID, "fast"), columns=0)
 
 
 def test_gif_loops_and_its_bars_are_the_weights(recording: Recording, tmp_path: Path) -> None:

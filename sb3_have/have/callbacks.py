@@ -119,8 +119,12 @@ class ModalityWeightsCallback(BaseCallback):
                 UserWarning,
                 stacklevel=2,
             )
-        elif self.folder is not None:
+            return
+        if self.folder is not None:
             self.folder.mkdir(parents=True, exist_ok=True)
+        if self.eval_env is not None and self.episode_freq and self._weigh is not None:
+            with same_random_numbers():  # what does not fit is refused now, not after the first ``episode_freq`` steps
+                self._record(self.model, self.eval_env, max_steps=1)
 
     def _on_step(self) -> bool:
         if self._weigh is None:

@@ -31,6 +31,8 @@ def plot_modality_weights(recording: Recording, columns: int = 8) -> Figure:
     """
     if not recording.weights:
         raise ValueError("the recording has no modality weights: record a model that has modality_weights()")
+    if columns < 1:
+        raise ValueError(f"columns={columns}: expected 1 or more")
     steps = len(recording.infos)
     # the middles of equal parts of the episode, so that thumbnails and time axis line up
     shown = ((np.arange(columns) + 0.5) / columns * steps).astype(int)
