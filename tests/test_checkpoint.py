@@ -22,7 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 from sb3_have import HAVESAC, DeepMDPCallback
 from sb3_have.common.checkpoint import ResumableCheckpointCallback, load_checkpoint, save_checkpoint
 from sb3_have.common.crossq import MultiInputCrossQ
-from sb3_have.common.env_state import ResumableEnv
+from sb3_have.common.env_state import ResumableEnv, environments_state, restore_environments
 
 
 def sac(env: Any, algorithm: Any = SAC, policy: str = "MlpPolicy", **kwargs: Any) -> Any:
@@ -134,13 +134,51 @@ def test_worker_processes(tmp_path: Path) -> None:
 def test_worker_processes_out_of_reach(tmp_path: Path) -> None:
     """Without ResumableEnv the episodes begin anew, from the same random numbers."""
     model = sac(SubprocVecEnv([Drifting] * 2)).learn(12)
-    with pytest.warns(UserWarning, match=r"SubprocVecEnv that are not wrapped in .*ResumableEnv\..* begin anew"):
+    with pytest.warns(UserWarning, match=r"SubprocVecEnv whose outermost wrapper is not .*ResumableEnv\..* begin anew"):
         save_checkpoint(model, tmp_path / "mine")
     resumed = load_checkpoint(tmp_path / "mine", SubprocVecEnv([Drifting] * 2), device="cpu")
     assert resumed._last_obs is None
     assert np.array_equal(resumed.env.reset(), model.env.reset())
     for one in (model, resumed):
         one.env.close()
+
+
+@pytest.mark.usefixtures("warm_workers")
+def test_worker_processes_that_are_others() -> None:
+    """Refused where the user sees it, and not in a worker, which would die of it."""
+
+    def workers(*wrappers: Any) -> SubprocVecEnv:
+        def make() -> gym.Env[Any, Any]:
+            env: gym.Env[Any, Any] = Drifting()
+            for wrapper in wrappers:
+                env = wrapper(env)
+            return env
+
+        return SubprocVecEnv([make])
+
+    inner, whole, bare = workers(ResumableEnv, Monitor), workers(Monitor, ResumableEnv), workers(ResumableEnv)
+    assert len(environments_state(inner).lost) == 1, "Monitor's state would be missing"
+    state = environments_state(whole)
+    assert state.lost == []
+    with pytest.raises(ValueError, match="outermost wrapper is not"):
+        restore_environments(inner, state)
+    with pytest.raises(ValueError, match="ResumableEnv > Monitor > Drifting, and it was given ResumableEnv > Drifting"):
+        restore_environments(bare, state)
+    for env in (inner, whole, bare):
+        env.reset()
+        env.close()
+
+
+def test_noise_of_a_training_that_has_not_begun(tmp_path: Path) -> None:
+    """`learn` makes the noise one for several environments, which resets it; nothing of it may be skipped."""
+    env = drifting(2)
+    model = sac(env, TD3, action_noise=noise(2))
+    for each in env.unwrapped.envs:  # type: ignore[attr-defined]
+        each.action_space.seed(1)  # which draws from the system's entropy otherwise, when first asked
+    save_checkpoint(model, tmp_path / "mine")
+    expected = everything(model.learn(20))
+    again = load_checkpoint(tmp_path / "mine", drifting(2), device="cpu")
+    assert_same(everything(again.learn(20)), expected)
 
 
 def test_training_that_a_callback_ends(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ import pytest
 import torch as th
 from resuming import Drifting, assert_same, everything, leaves
 from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import EveryNTimesteps
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -94,6 +95,29 @@ def test_damage_is_refused_by_name(tmp_path: Path) -> None:
     assert newest_checkpoint(tmp_path) == newest
 
 
+def test_damage_of_what_has_no_checksum(tmp_path: Path) -> None:
+    """Names, lengths and methods of the directory at the end, each bit of it."""
+    file, state = tmp_path / "file", {"frames": np.arange(1 << 20, dtype=np.uint8), "small": 1}
+    write_archive(file, {"steps": 1}, memoryview(b"model"), state)
+    whole = file.read_bytes()
+    start = whole.rindex(b"PK\1\2")  # of the last array's entry
+    n_refused = 0
+    for position in range(8 * start, 8 * len(whole), 3):
+        with open(file, "r+b") as broken:
+            broken.seek(position // 8)
+            broken.write(bytes([whole[position // 8] ^ 1 << position % 8]))
+        try:
+            loaded = read_archive(file)[2]
+        except DamagedCheckpointError:
+            n_refused += 1
+        else:
+            assert_same(leaves(loaded), leaves(state))
+        with open(file, "r+b") as broken:
+            broken.seek(position // 8)
+            broken.write(whole[position // 8 : position // 8 + 1])
+    assert n_refused > 50
+
+
 def test_what_is_no_checkpoint(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="has no checkpoint-<step> that can be read"):
         load_checkpoint(tmp_path, make_env())
@@ -131,6 +155,32 @@ def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str) 
     assert names(tmp_path) == ["checkpoint-10"]
     resumed = load_checkpoint(tmp_path, make_env(), device="cpu").learn(20, reset_num_timesteps=False)
     assert_same(everything(resumed), expected)
+
+
+def test_remains_that_cannot_be_removed(tmp_path: Path) -> None:
+    """In a folder that is read-only by now, say; here they are a folder."""
+    (tmp_path / "checkpoint-3.partial").mkdir()
+    with pytest.warns(UserWarning, match=r"checkpoint-9 could not be written \(.*; the training goes on without it"):
+        assert make_model().learn(9, ResumableCheckpointCallback(tmp_path, 100)).num_timesteps == 9
+
+
+def test_folder_that_cannot_be_synced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on some network file systems; the checkpoint is there, and older ones make room."""
+
+    def fsync(handle: int, original: Any = os.fsync) -> None:
+        if os.path.isdir(f"/proc/self/fd/{handle}"):
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        original(handle)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    make_model().learn(20, ResumableCheckpointCallback(tmp_path, 5, keep=1))
+    assert names(tmp_path) == ["checkpoint-20"]
+
+
+def test_callback_within_another_is_refused(tmp_path: Path) -> None:
+    every = EveryNTimesteps(5, ResumableCheckpointCallback(tmp_path, 5))
+    with pytest.raises(ValueError, match="within EveryNTimesteps never saves"):
+        make_model().learn(9, every)
 
 
 def test_disk_that_is_full_at_once_is_an_error_without_callback(

@@ -120,6 +120,14 @@ def test_functions_and_drawing_are_in_nobodys_way() -> None:
     assert np.array_equal(second.render(), first.render())  # type: ignore[arg-type]
 
 
+def test_any_name_is_an_environments_own() -> None:
+    """What SubprocVecEnv calls its workers may be something else in an environment."""
+    first, second = DummyVecEnv([Drifting]), DummyVecEnv([Drifting])
+    first.envs[0].processes = ["milling"]  # type: ignore[attr-defined]
+    restore_environments(second, environments_state(first))
+    assert second.envs[0].processes == ["milling"]  # type: ignore[attr-defined]
+
+
 def test_what_the_old_state_has_computed_is_forgotten() -> None:
     first, second = make_vec_env(), make_vec_env()
     second.reset()
@@ -222,6 +230,26 @@ def test_state_of_callbacks(tmp_path: Path) -> None:
     assert evaluation.n_calls == 10 and evaluation.best_mean_reward == first[1].best_mean_reward > -np.inf
     assert isinstance(evaluation.callback, StopTrainingOnNoModelImprovement)
     assert evaluation.callback.n_calls == 2 and evaluation.callback.last_best_mean_reward > -np.inf
+
+
+class Stateful(BaseCallback):
+    """Has a method that is not the one meant."""
+
+    calls = 0
+
+    def get_state(self, name: str) -> str:
+        return name
+
+    def _on_step(self) -> bool:
+        self.calls += 1
+        return True
+
+
+def test_method_that_is_only_called_alike(tmp_path: Path) -> None:
+    first, later = Stateful(), Stateful()
+    save_checkpoint(sac(make_vec_env()).learn(3, first), tmp_path / "mine", first)
+    load_checkpoint(tmp_path / "mine", make_vec_env(), later, device="cpu")
+    assert later.calls == 3
 
 
 class Newcomer(BaseCallback):

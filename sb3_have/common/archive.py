@@ -21,6 +21,9 @@ import numpy as np
 LARGE = 1 << 20
 """Bytes from which on an array is an entry of its own, which is written from its memory and read into it."""
 
+ENTRIES = ("info.json", "model.zip", "state.pkl")
+"""What every archive begins with; large arrays follow."""
+
 DAMAGES = (zipfile.BadZipFile, KeyError, EOFError, NotImplementedError, RuntimeError, ValueError)
 """What ``zipfile`` raises where bytes are missing or others, besides OSError EINVAL and EIO."""
 
@@ -123,13 +126,14 @@ def _set_aside(array: pickle.PickleBuffer, arrays: list[pickle.PickleBuffer]) ->
 
 
 def _sync_folder(folder: Path) -> None:
-    """Without this the new name may be lost with the power."""
+    """Without this the new name may be lost with the power; some network file systems cannot, and then it is so."""
     if hasattr(os, "O_DIRECTORY"):  # not on Windows
-        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+        with suppress(OSError):
+            handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+            try:
+                os.fsync(handle)
+            finally:
+                os.close(handle)
 
 
 def read_archive(path: Path) -> tuple[dict[str, Any], io.BytesIO, Any]:
@@ -142,8 +146,7 @@ def read_archive(path: Path) -> tuple[dict[str, Any], io.BytesIO, Any]:
     with _opened(path) as archive:
         info = json.loads(archive.read("info.json"))
         model, pickled = io.BytesIO(archive.read("model.zip")), archive.read("state.pkl")
-        n_arrays = sum(name.startswith("array-") for name in archive.namelist())
-        arrays = [_read_array(archive, f"array-{number}") for number in range(n_arrays)]
+        arrays = [_read_array(archive, name) for name in archive.namelist()[len(ENTRIES) :]]
     # outside, where an error is no damage but a class that is missing or another
     return info, model, Unpickler(io.BytesIO(pickled), buffers=arrays).load()
 
@@ -179,12 +182,22 @@ def check_archive(path: Path) -> None:
             raise zipfile.BadZipFile(f"Bad CRC-32 for file {broken!r}")
 
 
+def _check_directory(archive: zipfile.ZipFile) -> None:
+    """Names and lengths, which have no checksum; and cut off, a file may end with the model, an archive too."""
+    entries = archive.infolist()
+    names = [*ENTRIES, *(f"array-{number}" for number in range(len(entries) - len(ENTRIES)))]
+    stored = all(
+        entry.compress_type == zipfile.ZIP_STORED and entry.compress_size == entry.file_size for entry in entries
+    )
+    if not stored or [entry.filename for entry in entries] != names:
+        raise zipfile.BadZipFile("its entries are not those of a checkpoint")
+
+
 @contextmanager
 def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
     try:
         with zipfile.ZipFile(path) as archive:
-            # cut off, the file may end with that of the model, which is an archive too
-            archive.getinfo("info.json")
+            _check_directory(archive)
             yield archive
     except (*DAMAGES, OSError) as error:
         if isinstance(error, OSError) and error.errno not in (errno.EINVAL, errno.EIO, None):

@@ -9,8 +9,8 @@ import random
 import re
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -139,7 +139,8 @@ def load_checkpoint(
     if state["noise"]:
         vars(model.actor.action_dist).update({name: noise.to(model.device) for name, noise in state["noise"].items()})
         _skip_once(model.actor, "reset_noise")
-    if model.action_noise is not None:
+    # where the episodes begin anew, so does the noise
+    if model.action_noise is not None and model._last_obs is not None:
         _skip_once(model.action_noise, "reset")  # by which `learn` begins
     _restore_callbacks(callbacks, state["callbacks"])
     set_random_states(state["random"])
@@ -223,16 +224,17 @@ def write_checkpoint(folder: Path, model: OffPolicyAlgorithm, keep: int, **kwarg
     :return: whether it was saved; a warning tells why it was not, as on a full disk
     """
     path = folder / f"checkpoint-{model.num_timesteps}"
-    for remains in folder.glob("checkpoint-*.partial"):  # of a process that was killed while it wrote
-        remains.unlink()
     try:
+        for remains in folder.glob("checkpoint-*.partial"):  # of a process that was killed while it wrote
+            remains.unlink(missing_ok=True)
         save_checkpoint(model, path, **kwargs)
     except OSError as error:
         warnings.warn(f"{path} could not be written ({error}); the training goes on without it.", stacklevel=2)
         return False
     so_far = [each for each in checkpoints(folder) if checkpoint_step(each) <= model.num_timesteps]
     for old in so_far[:-keep]:
-        old.unlink()
+        with suppress(OSError):  # someone may be reading it; the next time
+            old.unlink()
     return True
 
 
@@ -241,7 +243,8 @@ class ResumableCheckpointCallback(BaseCallback):
     Saves checkpoints as a training goes, from which :func:`load_checkpoint` lets it go on exactly.
 
     First in a list of callbacks, it lets no ``_on_rollout_start`` be run twice where the training goes on. The state of
-    all callbacks of the training is saved. A checkpoint that cannot be written is told by a warning.
+    all callbacks of the training is saved. A checkpoint that cannot be written is told by a warning. Within another
+    callback (``EveryNTimesteps``) it would not be told of rollouts, and is refused.
 
     :param folder: for ``checkpoint-<step>``
     :param save_freq: steps from one to the next, in all environments together as ``num_timesteps``; there is a further
@@ -256,6 +259,13 @@ class ResumableCheckpointCallback(BaseCallback):
             raise ValueError(f"save_freq={save_freq}, keep={keep}: expected whole numbers from 1 on.")
         self.folder, self.save_freq, self.keep = Path(folder), save_freq, keep
         self._last_step = 0
+
+    def _init_callback(self) -> None:
+        if self.parent is not None:
+            raise ValueError(
+                f"ResumableCheckpointCallback within {type(self.parent).__name__} never saves; give it to `learn`, "
+                "alone or in a list, and how often it should save by `save_freq`"
+            )
 
     def _on_training_start(self) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -326,10 +336,13 @@ def _flattened(callbacks: Callbacks) -> list[BaseCallback]:
     return [each for each in found if not isinstance(each, CallbackList | ProgressBarCallback)]
 
 
+def _has_own_state(callback: BaseCallback) -> bool:
+    return hasattr(callback, "get_state") and hasattr(callback, "set_state")
+
+
 def _callback_state(callback: BaseCallback) -> Any:
-    get_state: Callable[[], Any] | None = getattr(callback, "get_state", None)
-    if get_state is not None:
-        return get_state()
+    if _has_own_state(callback):
+        return callback.get_state()  # type: ignore[attr-defined]
     # what the constructor takes is the user's, who may give something else when the training goes on
     constructors = [vars(each)["__init__"] for each in type(callback).__mro__ if "__init__" in vars(each)]
     given = {name for each in constructors for name in inspect.signature(each).parameters} | {"locals", "globals"}
@@ -352,7 +365,7 @@ def _restore_callbacks(callbacks: Callbacks, states: list[tuple[str, Any]]) -> N
         if index is None:
             continue  # it was not there then
         _, state = waiting.pop(index)
-        if hasattr(callback, "set_state"):
-            callback.set_state(state)
+        if _has_own_state(callback):
+            callback.set_state(state)  # type: ignore[attr-defined]
         else:
             vars(callback).update(state)

@@ -15,8 +15,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 from sb3_have.common.archive import dumps, loads
 
-NO_STATE = ("spec", "_cached_spec", "class_attributes", "remotes", "work_remotes", "processes")
-"""Attributes that tell how an environment was made, or lead to other processes."""
+NO_STATE = ("spec", "_cached_spec")
+"""Attributes of an environment that tell how it was made."""
+
+NO_VEC_STATE = ("class_attributes", "remotes", "work_remotes", "processes")
+"""Attributes of a ``VecEnv`` that tell its class, or lead to other processes."""
 
 DRAWING = ("pygame", "highway_env.envs.common.graphics")
 """Modules whose windows and surfaces an environment makes anew when it draws."""
@@ -48,7 +51,7 @@ class EnvironmentsState(NamedTuple):
         ]
 
 
-OUT_OF_REACH = "environments of SubprocVecEnv that are not wrapped in sb3_have.common.env_state.ResumableEnv"
+OUT_OF_REACH = "environments of SubprocVecEnv whose outermost wrapper is not sb3_have.common.env_state.ResumableEnv"
 
 
 class ResumableEnv(gym.Wrapper[Any, Any, Any, Any]):
@@ -64,6 +67,10 @@ class ResumableEnv(gym.Wrapper[Any, Any, Any, Any]):
     def checkpoint_state(self) -> LayersState:
         """State of the environment and of the process's own random numbers."""
         return _capture(_gym_layers(self), (random.getstate(), np.random.get_state()))
+
+    def checkpoint_layers(self) -> list[str]:
+        """Names of the classes that the state is of, outermost first."""
+        return _names(_gym_layers(self))
 
     def restore_checkpoint_state(self, state: LayersState) -> None:
         """
@@ -90,7 +97,7 @@ def environments_state(vec_env: VecEnv, shared: Any = None) -> EnvironmentsState
     if isinstance(base, DummyVecEnv):
         layers = [*layers, *(layer for env in base.envs for layer in _gym_layers(env))]
     elif isinstance(base, SubprocVecEnv):
-        resumable = all(base.env_is_wrapped(ResumableEnv))
+        resumable = _are_resumable(base)
         workers = base.env_method("checkpoint_state") if resumable else base.get_attr("np_random")
     state = _capture(layers, shared)
     if not isinstance(base, DummyVecEnv | SubprocVecEnv):
@@ -110,15 +117,29 @@ def restore_environments(vec_env: VecEnv, state: EnvironmentsState) -> Any:
     base = layers[-1]
     if isinstance(base, DummyVecEnv):
         layers = [*layers, *(layer for env in base.envs for layer in _gym_layers(env))]
-    shared = _restore(layers, state.layers)
     if len(state.workers) not in (0, vec_env.num_envs):
         raise ValueError(f"a checkpoint of {len(state.workers)} environments was given {vec_env.num_envs}")
+    shared = _restore(layers, state.layers)
+    if any(isinstance(worker, LayersState) for worker in state.workers):
+        # here, as an error in a worker would be its end
+        if not _are_resumable(base):
+            raise ValueError(
+                f"the checkpoint has the state of environments in ResumableEnv, and was given {OUT_OF_REACH}"
+            )
+        for names, worker in zip(base.env_method("checkpoint_layers"), state.workers, strict=True):
+            _check_names(worker.names, names)
     for index, worker in enumerate(state.workers):
         if isinstance(worker, LayersState):
             base.env_method("restore_checkpoint_state", worker, indices=index)
         else:
             base.set_attr("np_random", worker, indices=index)
     return shared
+
+
+def _are_resumable(base: SubprocVecEnv) -> bool:
+    """Whether ``ResumableEnv`` is around everything else in all workers."""
+    wrapped = all(base.env_is_wrapped(ResumableEnv))
+    return wrapped and set(base.env_method("class_name")) == {ResumableEnv.__name__}
 
 
 def _vec_layers(vec_env: VecEnv) -> list[Any]:
@@ -138,7 +159,7 @@ def _gym_layers(env: gym.Env[Any, Any]) -> list[Any]:
 
 
 def _capture(layers: Sequence[Any], shared: Any) -> LayersState:
-    names, states = [type(layer).__qualname__ for layer in layers], [_attributes(layer) for layer in layers]
+    names, states = _names(layers), [_attributes(layer) for layer in layers]
     known = [set(vars(layer)) for layer in layers]
     try:
         return LayersState(names, dumps((states, known, shared), layers), [])
@@ -165,10 +186,11 @@ def _capture(layers: Sequence[Any], shared: Any) -> LayersState:
 
 def _attributes(layer: Any) -> dict[str, Any]:
     """What belongs to the state of an environment or wrapper."""
+    no_state = NO_VEC_STATE if isinstance(layer, VecEnv) else NO_STATE
     return {
         name: value
         for name, value in vars(layer).items()
-        if name not in NO_STATE
+        if name not in no_state
         and not isinstance(value, ResultsWriter)
         and not type(value).__module__.startswith(DRAWING)
     }
@@ -184,13 +206,20 @@ def _failure(value: Any, layers: Sequence[Any]) -> str:
     return ""
 
 
-def _restore(layers: Sequence[Any], state: LayersState) -> Any:
-    names = [type(layer).__qualname__ for layer in layers]
-    if names != state.names:
+def _names(layers: Sequence[Any]) -> list[str]:
+    return [type(layer).__qualname__ for layer in layers]
+
+
+def _check_names(expected: list[str], names: list[str]) -> None:
+    if names != expected:
         raise ValueError(
-            f"the checkpoint is of environments with other wrappers: {' > '.join(state.names)}, and it was given "
+            f"the checkpoint is of environments with other wrappers: {' > '.join(expected)}, and it was given "
             f"{' > '.join(names)}; make them as in the training that wrote it"
         )
+
+
+def _restore(layers: Sequence[Any], state: LayersState) -> Any:
+    _check_names(state.names, _names(layers))
     states, known, shared = loads(state.pickled, layers)
     for layer, attributes, names in zip(layers, states, known, strict=True):
         if not state.lost:  # what is computed once and kept (functools.cached_property) may be of the old state
