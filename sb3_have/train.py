@@ -31,6 +31,7 @@ import sb3_have
 from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
 from sb3_have.common.checkpoint import (
     checkpoint_info,
+    checkpoints,
     load_checkpoint,
     refuse_older_form,
     same_random_numbers,
@@ -138,6 +139,7 @@ class Run:
         self.seconds = 0.0  # spent training and evaluating, over all sessions
         self.interrupted = False
         self._rollout_started = self._in_mid_rollout = False
+        self._saved_step = -1
 
     def train(self, steps: int, progress_bar: bool = False, keep_checkpoint: bool = True) -> OffPolicyAlgorithm:
         """Train up to a number of steps, from the newest checkpoint if there is one.
@@ -156,12 +158,15 @@ class Run:
     def _train(self, steps: int, progress_bar: bool, keep_checkpoint: bool) -> OffPolicyAlgorithm:
         refuse_older_form(self.out)
         checkpoint = newest_checkpoint(self.out)
+        if checkpoint is None and (damaged := checkpoints(self.out)):
+            raise ValueError(f"all checkpoints are damaged ({damaged[-1]} and before); remove them to begin anew")
         if checkpoint is None and (self.out / "model.zip").exists():
             raise ValueError(
                 f"{self.out} has a model.zip but no checkpoint to go on from, and training would begin anew, over it; "
                 "choose another folder, or remove this one (a benchmark keeps checkpoints with --keep-checkpoints)"
             )
         done = 0 if checkpoint is None else checkpoint_step(checkpoint)
+        self._saved_step = done
         if checkpoint is not None:
             self._check_same_run(checkpoint)
         self._forget_after(done)
@@ -199,8 +204,8 @@ class Run:
     def _check_same_run(self, checkpoint: Path) -> None:
         state = checkpoint_info(checkpoint)["info"]
         now = self._settings()
-        if state["settings"] != now:
-            raise ValueError(f"{checkpoint} is of a run with {state['settings']}, not {now}; choose another folder")
+        if (settings := state.get("settings")) != now:
+            raise ValueError(f"{checkpoint} is of a run with {settings}, not {now}; choose another folder")
         self.seconds = state["seconds"]
 
     def _make_model(self, checkpoint: Path | None, env: VecEnv) -> OffPolicyAlgorithm:
@@ -238,10 +243,11 @@ class Run:
             write_atomically(path, partial(Path.write_text, data="".join([head, *lines[: kept + 1]])))
 
     def save(self, model: Any, rollout_started: bool = False) -> None:
-        """Write ``checkpoint-<step>``, unless it is there; see :func:`~sb3_have.common.checkpoint.save_checkpoint`."""
-        if not (self.out / f"checkpoint-{model.num_timesteps}").exists():
+        """Write ``checkpoint-<step>``, unless it has been; see :func:`~sb3_have.common.checkpoint.save_checkpoint`."""
+        if model.num_timesteps != self._saved_step:  # a file of that name may be a damaged one
             info = {"seconds": self.seconds, "settings": self._settings()}
-            write_checkpoint(self.out, model, KEPT_CHECKPOINTS, info=info, rollout_started=rollout_started)
+            if write_checkpoint(self.out, model, KEPT_CHECKPOINTS, info=info, rollout_started=rollout_started):
+                self._saved_step = model.num_timesteps
 
     def evaluate_if_due(self, model: Any) -> None:
         """Evaluate, if there is no evaluation since the last multiple of ``eval_freq``; the training does not notice.
@@ -249,7 +255,7 @@ class Run:
         :param model: between two rollouts
         """
         path = self.out / "evaluation.csv"
-        last_step = int(pd.read_csv(path)["step"].max()) if path.exists() else 0
+        last_step = int(max(pd.read_csv(path)["step"], default=0)) if path.exists() else 0
         if is_due(self.eval_freq, model.num_timesteps, last_step):
             with same_random_numbers():
                 self.evaluate(model, model.num_timesteps)

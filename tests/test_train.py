@@ -20,8 +20,9 @@ from resuming import assert_same, everything, leaves
 import sb3_have
 from sb3_have import train
 from sb3_have.common import files
+from sb3_have.common.checkpoint import save_checkpoint
 from sb3_have.configuration import load_config, model_kwargs
-from sb3_have.train import Run, newest_checkpoint
+from sb3_have.train import Run, make_training_env, newest_checkpoint
 
 
 def make_run(out: Path, **kwargs: Any) -> Run:
@@ -194,6 +195,29 @@ def test_model_without_checkpoint_is_not_trained_over(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"no checkpoint to go on from"):
         make_run(tmp_path).train(12)
     assert len(pd.read_csv(tmp_path / "evaluation.csv")) == 2
+
+
+def test_damaged_checkpoints(tmp_path: Path) -> None:
+    """The newest is written again when the run comes by; if no other is left, nothing is thrown away."""
+    make_run(tmp_path, save_freq=6).train(12)
+    (tmp_path / "checkpoint-12").write_bytes(b"")
+    with pytest.warns(UserWarning, match="checkpoint-12 is damaged"):
+        make_run(tmp_path, save_freq=6).train(12)
+    assert newest_checkpoint(tmp_path) == tmp_path / "checkpoint-12"
+    records = (tmp_path / "monitor.csv").read_text()
+    for path in tmp_path.glob("checkpoint-*"):
+        path.write_bytes(b"")
+    with pytest.warns(UserWarning, match="is damaged"), pytest.raises(ValueError, match="checkpoint-12 and before"):
+        make_run(tmp_path).train(12)
+    assert (tmp_path / "monitor.csv").read_text() == records
+
+
+def test_checkpoint_of_another_program_is_refused(tmp_path: Path) -> None:
+    model = make_run(tmp_path / "run").train(8)
+    model.set_env(make_training_env(ENV_ID, CONFIG))
+    save_checkpoint(model, tmp_path / "checkpoint-8")
+    with pytest.raises(ValueError, match="of a run with None, not"):
+        make_run(tmp_path).train(12)
 
 
 def test_two_checkpoints_stay(tmp_path: Path) -> None:
