@@ -6,6 +6,7 @@ from sb3_have import envs as envs  # registers the environments
 from sb3_have.common.buffers import ModalityReplayBuffer
 from sb3_have.common.checkpoint import ResumableCheckpointCallback, load_checkpoint, save_checkpoint
 from sb3_have.common.evaluation import evaluate
+from sb3_have.common.recording import Recording, record_episode
 from sb3_have.export import export_onnx, export_safetensors, load_policy
 from sb3_have.have import HAVESAC, DeepMDPCallback, ModalityWeightsCallback, MultiModalCritic, MultiModalPolicy
 
@@ -18,6 +19,7 @@ __all__ = [
     "ModalityWeightsCallback",
     "MultiModalCritic",
     "MultiModalPolicy",
+    "Recording",
     "ResumableCheckpointCallback",
     "__version__",
     "evaluate",
@@ -25,5 +27,6 @@ __all__ = [
     "export_safetensors",
     "load_checkpoint",
     "load_policy",
+    "record_episode",
     "save_checkpoint",
 ]
