@@ -106,6 +106,16 @@ def test_training_past_the_grid_is_not_driven(tmp_path: Path) -> None:
     assert not (tmp_path / job.name / "final-30").exists()
 
 
+def test_training_that_ends_a_rollout_late_is_driven(tmp_path: Path) -> None:
+    """As when it was stopped at an odd step, with an update every second one."""
+    job = make_grid(tmp_path, {"train_freq": 2}).jobs()[0]
+    run = Run(job.config, ENV_ID, tmp_path / job.name, eval_freq=0)
+    run.train(1)  # two steps, as rollouts are whole
+    assert run_job(make_grid(tmp_path, {"train_freq": 2}, steps=31).jobs()[0], tmp_path)
+    assert newest_checkpoint(tmp_path / job.name) is None
+    assert (tmp_path / job.name / "final-31" / "episodes.csv").exists()
+
+
 def test_stop_in_the_last_evaluation_is_a_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     job = make_grid(tmp_path, eval_freq=30).jobs()[0]
     with monkeypatch.context() as patch:
