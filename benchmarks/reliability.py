@@ -54,17 +54,24 @@ def run_small(seeds: Sequence[int] = (0, 1), n_updates: int = 2000, n_workers: i
 
 
 def run_all(
-    runs: Sequence[tuple[str, int]], n_updates: int, n_workers: int, task: Mapping[str, Any] | None = None
+    runs: Sequence[tuple[str, int]],
+    n_updates: int,
+    n_workers: int,
+    task: Mapping[str, Any] | None = None,
+    hyperparameters: Mapping[str, Any] | None = None,
 ) -> Iterator[list[tuple[str, int, int, str, float]]]:
-    """Rows of each run (method, seed) on a task as it ends, in the order in which they end."""
+    """
+    Rows of each run (method, seed) on a task as it ends, in the order in which they end; ``hyperparameters`` stand in
+    the place of the benchmark's own, for all methods alike.
+    """
     if n_workers == 1:
         for method, seed in runs:
-            yield _run(method, seed, n_updates, task)
+            yield _run(method, seed, n_updates, task, hyperparameters)
         return
     # Fresh processes: torch's threads do not survive a fork
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(n_workers, mp_context=context) as pool:
-        futures = [pool.submit(_run, method, seed, n_updates, task) for method, seed in runs]
+        futures = [pool.submit(_run, method, seed, n_updates, task, hyperparameters) for method, seed in runs]
         try:
             for future in as_completed(futures):
                 yield future.result()
@@ -75,10 +82,14 @@ def run_all(
 
 
 def _run(
-    method: str, seed: int, n_updates: int, task: Mapping[str, Any] | None = None
+    method: str,
+    seed: int,
+    n_updates: int,
+    task: Mapping[str, Any] | None = None,
+    hyperparameters: Mapping[str, Any] | None = None,
 ) -> list[tuple[str, int, int, str, float]]:
     start = time.perf_counter()
-    measures = run(method, seed, n_updates, task)
+    measures = run(method, seed, n_updates, task, hyperparameters)
     measures["seconds"] = time.perf_counter() - start
     return [(method, seed, n_updates, measure, value) for measure, value in measures.items()]
 
@@ -101,10 +112,10 @@ def save(rows: Sequence[tuple[str, int, int, str, float]], folder: Path) -> None
     written.replace(file)
 
 
-def missing(rows: pd.DataFrame, methods: Sequence[str], n_seeds: int, n_updates: int) -> list[tuple[str, int]]:
+def missing(rows: pd.DataFrame, methods: Sequence[str], seeds: Sequence[int], n_updates: int) -> list[tuple[str, int]]:
     """Runs (method, seed) that are still to be made, seed by seed, so that whatever is there compares all methods."""
     done = set(rows.loc[rows["updates"] == n_updates, ["method", "seed"]].itertuples(index=False, name=None))
-    return [(method, seed) for seed, method in itertools.product(range(n_seeds), methods) if (method, seed) not in done]
+    return [(method, seed) for seed, method in itertools.product(seeds, methods) if (method, seed) not in done]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -125,11 +136,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if args.out is None:
         name = f"n_blind-{args.n_blind}-corruption-{args.corruption:g}"
         args.out = OUT if task == STANDARD_TASK else OUT / name
-    todo = [] if args.report else missing(load(args.out), args.methods, args.seeds, args.updates)
+    todo = [] if args.report else missing(load(args.out), args.methods, range(args.seeds), args.updates)
     for i, rows in enumerate(run_all(todo, args.updates, args.workers, task), 1):
         save(rows, args.out)
         told = {measure: value for _, _, _, measure, value in rows}
-        print(f"{i}/{len(todo)} {rows[0][0]}-{rows[0][1]}: {_summary(told)}", flush=True)
+        print(f"{i}/{len(todo)} {rows[0][0]}-{rows[0][1]}: {summary(told)}", flush=True)
     table = load(args.out)
     chosen = table["updates"].eq(args.updates) & table["seed"].lt(args.seeds)
     text = report(table[chosen], args.methods)
@@ -138,7 +149,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         (args.out / "report.md").write_text(text)
 
 
-def _summary(measures: Mapping[str, float]) -> str:
+def summary(measures: Mapping[str, float]) -> str:
+    """The measures that tell most of a run, in a line."""
     names = ("final_return", "area", "weight_auc", "value_bias", "kept_black", "kept_frozen", "kept_noise", "seconds")
     return ", ".join(f"{name} {measures[name]:.4g}" for name in names)
 

@@ -164,7 +164,13 @@ def gve_width() -> int:
     return low
 
 
-def run(method: str, seed: int, n_updates: int, task: Mapping[str, Any] | None = None) -> dict[str, float]:
+def run(
+    method: str,
+    seed: int,
+    n_updates: int,
+    task: Mapping[str, Any] | None = None,
+    hyperparameters: Mapping[str, Any] | None = None,
+) -> dict[str, float]:
     """
     Trains one method and measures it.
 
@@ -172,6 +178,7 @@ def run(method: str, seed: int, n_updates: int, task: Mapping[str, Any] | None =
     :param seed: of the training; the episodes of the evaluations are the same for all
     :param n_updates: of the critic
     :param task: options of the environment, ``n_blind`` and ``corruption``
+    :param hyperparameters: in the place of those of ``HYPERPARAMETERS``, e.g. ``{"learning_rate": 3e-4}``
     :return: measures by name, NaN where a method has no such part:
         ``return_<n>`` mean return after n updates, ``final_return`` the last of them and ``area`` their mean;
         ``weight_auc`` and ``weight_auc_in_step``, see :class:`Drive`;
@@ -183,7 +190,7 @@ def run(method: str, seed: int, n_updates: int, task: Mapping[str, Any] | None =
     """
     th.set_num_threads(1)
     task = dict(task or {})
-    model = make_model(method, seed, task)
+    model = make_model(method, seed, task, **(hyperparameters or {}))
     measures: dict[str, float] = {}
     for i in range(N_EVALUATIONS):
         due = n_updates * (i + 1) // N_EVALUATIONS

@@ -194,7 +194,7 @@ def test_a_run_has_all_measures_and_repeats_itself() -> None:
     }
 
 
-def fake_run(method: str, seed: int, n_updates: int, task: Any = None) -> dict[str, float]:
+def fake_run(method: str, seed: int, n_updates: int, task: Any = None, hyperparameters: Any = None) -> dict[str, float]:
     names = ("final_return", "area", "weight_auc", "value_bias", "kept_black", "kept_frozen", "kept_noise")
     return dict.fromkeys(names, float(seed)) | {"return_10": 1.0, "weight_auc": float("nan")}
 
@@ -202,7 +202,7 @@ def fake_run(method: str, seed: int, n_updates: int, task: Any = None) -> dict[s
 def test_runs_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[tuple[str, int]] = []
 
-    def run(method: str, seed: int, n_updates: int, task: Any = None) -> dict[str, float]:
+    def run(method: str, seed: int, n_updates: int, task: Any = None, hyperparameters: Any = None) -> dict[str, float]:
         if len(made) == 3:
             raise KeyboardInterrupt
         made.append((method, seed))
@@ -214,12 +214,14 @@ def test_runs_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
         reliability.main(arguments)
     assert made == [("have", 0), ("gve", 0), ("have", 1)]
     monkeypatch.setattr(reliability, "run", fake_run)
-    assert reliability.missing(reliability.load(tmp_path), ["have", "gve"], 2, reliability.N_UPDATES) == [("gve", 1)]
+    assert reliability.missing(reliability.load(tmp_path), ["have", "gve"], (0, 1), reliability.N_UPDATES) == [
+        ("gve", 1)
+    ]
     reliability.main(arguments)
     rows = reliability.load(tmp_path)
-    assert reliability.missing(rows, ["have", "gve"], 2, reliability.N_UPDATES) == []
+    assert reliability.missing(rows, ["have", "gve"], (0, 1), reliability.N_UPDATES) == []
     assert not rows.duplicated(["method", "seed", "updates", "measure"]).any()
-    assert len(reliability.missing(rows, ["have"], 2, 10)) == 2  # of another length
+    assert len(reliability.missing(rows, ["have"], (0, 1), 10)) == 2  # of another length
     assert values(rows, "have", "area").to_dict() == {0: 0.0, 1: 1.0}
     assert values(rows, "have", "weight_auc").empty
     assert not (tmp_path / "report.md").exists()
