@@ -21,8 +21,9 @@ from benchmark_results import (
 )
 from matplotlib.figure import Figure
 
+from sb3_have.benchmark.provenance import flatten
 from sb3_have.benchmark.reading import ResultsError, read_csv, read_results
-from sb3_have.benchmark.report import flatten, main, write_report
+from sb3_have.benchmark.report import main, write_report
 
 
 @pytest.fixture
@@ -129,6 +130,8 @@ def test_report_and_all_that_it_shows(tmp_path: Path, capsys: pytest.CaptureFixt
     for name in re.findall(r"`(table_\w+\.csv)`", report):
         assert len(pd.read_csv(out / name))
     assert "`have` is first in distance in 2 of 2 weathers." in report
+    assert "is better in distance while training, its 95% interval: including 0.5 for `sac`" in report
+    assert "at steps 1,000 and 2,000. It tells who learns sooner." in report
     assert "best first: `have` 222 m, `sac` 150 m." in report
     assert "| have   | 4        | 0.75    | 0.00          | 30         |" in report
     assert "gamma: 0.9\npolicy_kwargs.features_dim: 50\n" in report and '| sac    | name    | "sac"  |' in report

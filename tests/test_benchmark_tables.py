@@ -146,6 +146,19 @@ def test_statistics_by_hand(results: Results) -> None:
     assert sac["iqm_lower"] == sac["iqm_upper"] == 150
 
 
+def test_areas_by_hand(tmp_path: Path) -> None:
+    """A run that is not finished, and steps that only one run was evaluated at, are left out."""
+    rows = evaluations(shares={1000: 0.5, 2000: 1.0})
+    rows += final({"have": {0: (9000.0, 9000.0)}}, step=1500) + final({"have": {2: (9000.0, 9000.0)}}, step=1000)
+    results = read(tmp_path, final=final(), evaluations=rows)
+    assert results.shared_steps() == [1000, 2000]
+    np.testing.assert_allclose(results.areas("have", DISTANCE), 0.75 * results.scores("have", DISTANCE))
+    table = tables.score_table(results, areas=True)
+    sac, have = (row for row in table.to_dict("records") if row["measure"] == "distance")
+    assert have["iqm"] == 0.75 * 220 and sac["improvement"] == 7 / 8
+    assert tables.score_table(read(tmp_path / "none", final=final()), areas=True).empty
+
+
 @pytest.mark.usefixtures("words_only")
 def test_no_interval_from_a_single_seed(tmp_path: Path) -> None:
     runs = {**DISTANCES, "lve": {0: (160, 180)}}

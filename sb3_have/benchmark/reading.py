@@ -146,6 +146,21 @@ class Results:
         table = rows.pivot(index="seed", columns="weather", values=f"{measure.name}_mean")
         return table.reindex(columns=self.weathers).to_numpy(float)
 
+    def shared_steps(self) -> list[int]:
+        """Steps at which every finished run was evaluated in every weather while training."""
+        runs = self.finished[["method", "seed"]].drop_duplicates()
+        rows = self["evaluations"].merge(runs, on=["method", "seed"])
+        counts = rows.groupby("step").size()
+        return sorted(int(step) for step in counts.index[counts == len(runs) * len(self.weathers)])
+
+    def areas(self, method: str, measure: Measure) -> NDArray[np.float64]:
+        """Means over the evaluations at :meth:`shared_steps` of the finished runs (n_seeds, n_weathers)."""
+        rows = self["evaluations"]
+        rows = rows[(rows["method"] == method) & rows["seed"].isin(self.finished_seeds(method))]
+        rows = rows[rows["step"].isin(self.shared_steps())]
+        table = rows.pivot_table(index="seed", columns="weather", values=f"{measure.name}_mean")
+        return table.reindex(columns=self.weathers).to_numpy(float)
+
     def scored(self) -> list[str]:
         """Methods with a finished run, in order."""
         return ordered(set(self.finished["method"]))

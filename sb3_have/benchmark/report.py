@@ -9,17 +9,15 @@ of what there is, and says what is missing.
 from __future__ import annotations
 
 import argparse
-import json
-import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any
 
 import pandas as pd
 from matplotlib.figure import Figure
 
 from sb3_have.benchmark import figures, tables
-from sb3_have.benchmark.reading import RETURN, Measure, Results, ResultsError, grid_of, ordered, read_results
+from sb3_have.benchmark.provenance import provenance
+from sb3_have.benchmark.reading import RETURN, Measure, Results, ResultsError, ordered, read_results
 from sb3_have.plotting import weather_weights
 
 DPI = 110
@@ -72,7 +70,9 @@ class Report:
         if self.methods:
             self.weather_table = tables.weather_table(self.results)
             self.scores = tables.score_table(self.results, self.reference)
-            parts += [*self._summary(), *self._weathers(), *self._ablation(), *self._statistics(), *self._ends()]
+            self.areas = tables.score_table(self.results, self.reference, areas=True)
+            parts += [*self._summary(), *self._weathers(), *self._ablation(), *self._statistics(), *self._areas()]
+            parts += self._ends()
         parts += [*self._curves(), *self._weights(), *self._failures(), *self._provenance()]
         path = self.out / "report.md"
         path.write_text("\n\n".join(parts) + "\n", encoding="utf-8")
@@ -90,6 +90,7 @@ class Report:
         for measure in reversed(self.results.measures):
             lines += _standing(self.weather_table, measure, self.reference, self.results.weathers)
             lines += _improvements(self.scores, measure, self.reference)
+            lines += _improvements(self.areas, measure, self.reference, " while training")
         return ["## In short", "\n".join(f"- {line}" for line in lines)]
 
     def _weathers(self) -> list[str]:
@@ -154,6 +155,21 @@ class Report:
             parts.append(
                 f"Performance profiles: share of scores above a threshold of {measure.name}. Drawn without intervals."
             )
+        return parts
+
+    def _areas(self) -> list[str]:
+        steps = self.results.shared_steps()
+        if not steps:
+            return []
+        self._save_table("areas", self.areas)
+        parts = ["## While training"]
+        for measure in reversed(self.results.measures):
+            parts.append(tables.score_markdown(self.areas, measure, self.reference))
+        parts.append(
+            "Area under the learning curve: here a score is the mean over the evaluations of a seed in a weather while "
+            f"training, at steps {_listed(f'{step:,}' for step in steps)}. It tells who learns sooner. Else as above. "
+            "Numbers: `table_areas.csv`."
+        )
         return parts
 
     def _ends(self) -> list[str]:
@@ -300,7 +316,7 @@ def _standing(table: pd.DataFrame, measure: Measure, reference: str, weathers: S
     return lines
 
 
-def _improvements(scores: pd.DataFrame, measure: Measure, reference: str) -> list[str]:
+def _improvements(scores: pd.DataFrame, measure: Measure, reference: str, when: str = "") -> list[str]:
     """Over which methods the reference is better by more than chance, in sentences."""
     rows = scores[(scores["measure"] == measure.name) & scores["improvement"].notna()]
     if rows.empty:
@@ -317,64 +333,7 @@ def _improvements(scores: pd.DataFrame, measure: Measure, reference: str) -> lis
         for label, chosen in groups.items()
         if chosen.any()
     ]
-    return [f"Probability that `{reference}` is better in {measure.name}, its 95% interval: {'; '.join(told)}."]
-
-
-def provenance(results: Results, out: Path) -> list[str]:
-    """On what the runs were made, with which settings, and by which commands.
-
-    :param out: folder of the report
-    """
-    runs, parts = results["runs"], []
-    if runs.empty:
-        parts.append("There is no `runs.csv`: machine, versions and settings are not known.")
-    else:
-        for name, title in (("machine", "Machines"), ("versions", "Versions")):
-            counts = runs[name].value_counts()
-            parts.append(f"{title}:\n\n" + "\n".join(f"- {text} ({n} runs)" for text, n in counts.items()))
-        parts += _settings(runs)
-    grids = [grid_of(folder) for folder in results.folders]
-    shown = [shlex.quote(_shown(grid) if grid.exists() else grid.name) for grid in grids]
-    commands = [f"python -m sb3_have.benchmark run {grid}" for grid in shown]
-    folders = [shlex.quote(_shown(folder)) for folder in results.folders]
-    commands.append(f"python -m sb3_have.benchmark report {' '.join(folders)} --out {shlex.quote(_shown(out))}")
-    return [*parts, "Commands:", "```\n" + "\n".join(commands) + "\n```"]
-
-
-def _settings(runs: pd.DataFrame) -> list[str]:
-    """The settings that all runs share, and by method those that they do not."""
-    of_runs = [flatten(json.loads(text)) for text in runs["settings"]]
-    keys = list(dict.fromkeys(key for settings in of_runs for key in settings))
-    same = [key for key in keys if all(key in s and s[key] == of_runs[0][key] for s in of_runs)]
-    shared = "\n".join(f"{key}: {json.dumps(of_runs[0][key])}" for key in same)
-    parts = ["Settings of all runs:", f"```yaml\n{shared}\n```"] if same else []
-    rows = []
-    for method in ordered(set(runs["method"])):
-        own = [settings for settings, name in zip(of_runs, runs["method"], strict=True) if name == method]
-        for key in (key for key in keys if key not in same):
-            values = list(dict.fromkeys(json.dumps(settings[key]) for settings in own if key in settings))
-            if values:
-                rows.append([method, key, " or ".join(values)])
-    if rows:
-        parts += ["Settings of a method:", tables.markdown(["method", "setting", "value"], rows)]
-    return parts
-
-
-def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by dotted names: ``{"a": {"b": 1}}`` is ``{"a.b": 1}``."""
-    flat: dict[str, Any] = {}
-    for key, value in settings.items():
-        if isinstance(value, Mapping) and value:
-            flat |= flatten(value, f"{prefix}{key}.")
-        else:
-            flat[f"{prefix}{key}"] = value
-    return flat
-
-
-def _shown(path: Path) -> str:
-    """A path relative to the working directory where it lies in there."""
-    absolute = path.resolve()
-    return absolute.relative_to(Path.cwd()).as_posix() if absolute.is_relative_to(Path.cwd()) else absolute.as_posix()
+    return [f"Probability that `{reference}` is better in {measure.name}{when}, its 95% interval: {'; '.join(told)}."]
 
 
 def _listed(names: Iterable[str]) -> str:

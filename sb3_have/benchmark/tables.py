@@ -136,23 +136,26 @@ def ablation_markdown(results: Results, table: pd.DataFrame) -> str:
     return markdown(["method", "values", "parameters", "seeds", *heads], rows)
 
 
-def score_table(results: Results, reference: str = "have") -> pd.DataFrame:
+def score_table(results: Results, reference: str = "have", areas: bool = False) -> pd.DataFrame:
     """Statistics over seeds and weathers with their 95% intervals, NaN where a method has a single seed.
 
     :param reference: method whose probability of improvement over each of the others is asked for
+    :param areas: of the areas under the learning curves instead of the final evaluations; no rows without evaluations
+        that all runs share
     :return: a row for each measure and method: ``measure``, ``method``, ``seeds``, ``iqm``, ``iqm_lower``,
         ``iqm_upper``, ``improvement``, ``improvement_lower``, ``improvement_upper`` (NaN for the reference itself)
     """
     rows = []
-    methods = results.scored()
+    methods = results.scored() if not areas or results.shared_steps() else []
+    of_method = results.areas if areas else results.scores
     for measure in results.measures:
         for method in methods:
-            scores = results.scores(method, measure)
+            scores = of_method(method, measure)
             row: dict[str, Any] = {"measure": measure.name, "method": method, "seeds": len(scores)}
             row |= _named("iqm", interval(iqm, scores))
             improvement = Interval(np.nan, np.nan, np.nan)
             if reference in methods and method != reference:
-                improvement = interval(probability_of_improvement, results.scores(reference, measure), scores)
+                improvement = interval(probability_of_improvement, of_method(reference, measure), scores)
             rows.append(row | _named("improvement", improvement))
     columns = [f"{name}{end}" for name in ("iqm", "improvement") for end in ("", "_lower", "_upper")]
     return pd.DataFrame(rows, columns=["measure", "method", "seeds", *columns])
