@@ -78,6 +78,7 @@ def structure() -> Figure:
         arrow(axis, (12.5, y), (17, y))
         arrow(axis, (29, y), (40.5, y))
         arrow(axis, (57.5, y), (66, 37 + (y - 37) * 0.25))
+        branch(axis, (34, y))
     line(axis, (34, 48), (34, 16))
     arrow(axis, (34, 17), (34, 15))
     box(axis, (34, 11.5), "fused $z_g = (z_1, z_2, z_3)$", BLUE, width=24)
@@ -89,6 +90,7 @@ def structure() -> Figure:
     box(axis, (74, 37), "$q_l = \\sum_i w_i\\,q_i$", GREEN, width=16)
     line(axis, (34, 8), (34, 3))
     line(axis, (34, 3), (94, 3))
+    branch(axis, (76, 3))
     arrow(axis, (76, 3), (76, 8))
     box(axis, (76, 11.5), "global critic\n$q_g(z_g,\\,a)$", BLUE, width=15)
     arrow(axis, (94, 3), (94, 20.5))
@@ -119,6 +121,11 @@ def arrow(axis: Axes, start: tuple[float, float], end: tuple[float, float], styl
 
 def line(axis: Axes, start: tuple[float, float], end: tuple[float, float]) -> None:
     axis.plot(*zip(start, end, strict=True), color=GREY, lw=1)
+
+
+def branch(axis: Axes, point: tuple[float, float]) -> None:
+    """Lines that meet here are joined, others only cross."""
+    axis.plot(*point, "o", color=GREY, markersize=4.5)
 
 
 def values(seeds: Sequence[int] = SEEDS, n_updates: int = N_UPDATES) -> Figure:
