@@ -52,11 +52,16 @@ def locked(folder: Path, patience: float = 5.0) -> Iterator[None]:
 
 
 def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
-    """Write a file so that it is whole or, if the process dies, still as it was.
+    """Write a file so that it is whole or, if that fails or the process dies, still as it was.
 
     :param path: of the file
     :param write: is given the path to write to
     """
     unfinished = path.with_name(f"{path.name}.partial")
-    write(unfinished)
-    unfinished.replace(path)
+    try:
+        write(unfinished)
+        unfinished.replace(path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            unfinished.unlink(missing_ok=True)
+        raise
