@@ -61,7 +61,7 @@ def whiskers(axis: Axes) -> list[list[float]]:
 
 
 def test_learning_curves_are_means_of_weathers_with_the_range_of_seeds(results: Results) -> None:
-    figure = figures.plot_learning_curves(results)
+    figure = figures.plot_progress(results)
     distance, ret = panel(figure, "distance"), panel(figure, "return")
     assert points(line(distance, "have (2)")) == [(1000, 111.25), (2000, 222.5)]
     assert points(line(distance, "sac (2)")) == [(1000, 75), (2000, 150)]
@@ -74,7 +74,7 @@ def test_learning_curves_are_means_of_weathers_with_the_range_of_seeds(results: 
 def test_learning_curves_leave_out_seeds_that_lag_behind(tmp_path: Path) -> None:
     rows = evaluations({"have": {0: (100, 200)}}) + evaluations({"have": {1: (1000, 2000)}}, {1000: 1.0})
     rows += evaluations({"have": {0: (999,)}}, {3000: 1.0})  # not yet in every weather
-    figure = figures.plot_learning_curves(read(tmp_path, evaluations=rows))
+    figure = figures.plot_progress(read(tmp_path, evaluations=rows))
     assert points(line(panel(figure, "distance"), "have (1)")) == [(1000, 75), (2000, 150)]
     assert not panel(figure, "distance").collections  # a single seed has no band
 
@@ -82,17 +82,22 @@ def test_learning_curves_leave_out_seeds_that_lag_behind(tmp_path: Path) -> None
 def test_learning_curves_of_many_methods_share_the_reference(tmp_path: Path) -> None:
     methods = ["have", *(f"method{i}" for i in range(9))]
     rows = evaluations({name: {0: (i, i)} for i, name in enumerate(methods)})
-    figure = figures.plot_learning_curves(read(tmp_path, evaluations=rows))
+    figure = figures.plot_progress(read(tmp_path, evaluations=rows))
     drawn = [[str(line.get_label()) for line in axis.get_lines()] for axis in figure.axes]
     assert [len(names) for names in drawn] == [8, 8, 3, 3] and all("have (1)" in names for names in drawn)
+    (bottom, top), *_ = [axis.get_ylim() for axis in figure.axes if "distance" in axis.get_ylabel()]
+    assert bottom == 0 and top > 9, "those of the second row are no less in reach"
 
 
 def test_drivers_are_levels_unless_far_above(tmp_path: Path) -> None:
     drivers = [{"driver": d, "weather": NOON, **moments(x)} for d, x in (("random", 50), ("IDM", 2134))]
-    figure = figures.plot_learning_curves(read(tmp_path, evaluations=evaluations(), drivers=drivers))
+    figure = figures.plot_progress(read(tmp_path, evaluations=evaluations(), drivers=drivers))
     axis = panel(figure, "distance")
     assert {y for _, y in points(line(axis, "random"))} == {50}
     assert axis.get_title() == "above: IDM 2134" and axis.get_ylim()[1] < 400
+    drivers[0] |= moments(270)  # above the curves, by little
+    figure = figures.plot_progress(read(tmp_path, evaluations=evaluations(), drivers=drivers[:1]))
+    assert panel(figure, "distance").get_ylim()[1] > 270
 
 
 def test_intervals_are_drawn_where_they_are(tmp_path: Path) -> None:
@@ -191,7 +196,7 @@ def test_methods_look_different_and_always_the_same() -> None:
 
 
 def test_letters_are_legible(results: Results) -> None:
-    for figure in (figures.plot_learning_curves(results), figures.plot_scores(results), figures.plot_profiles(results)):
+    for figure in (figures.plot_progress(results), figures.plot_scores(results), figures.plot_profiles(results)):
         figure.draw_without_rendering()
         sizes = [
             float(text.get_fontsize()) for text in figure.findobj(Text) if isinstance(text, Text) and text.get_text()

@@ -15,6 +15,7 @@ from PIL import Image
 from sb3_have.common.drivers import KeepStraightDriver
 from sb3_have.common.recording import Recording, record_episode
 from sb3_have.plotting import Frames, modality_colours, plot_learning_curve, plot_modality_weights, write_gif
+from sb3_have.plotting.episode import images
 
 
 class Weighing(KeepStraightDriver):
@@ -27,7 +28,7 @@ class Weighing(KeepStraightDriver):
 
 @pytest.fixture
 def recording() -> Recording:
-    return record_episode(Weighing(), ENV_ID, "fast", seed=4)
+    return record_episode(Weighing(), ENV_ID, "fast", seed=4, render=True)
 
 
 def pixels(figure: Figure) -> np.ndarray:
@@ -68,6 +69,7 @@ def test_learning_curve_shows_steps_and_running_mean() -> None:
     panels = plot_learning_curve(episodes, window=2, by_weather=True).axes
     assert [panel.get_title() for panel in panels] == ["fast", "slow"]
     np.testing.assert_allclose(points(panels[1].get_lines()[0]), [[10, 1], [60, 8]])
+    assert panels[0].get_xlim()[0] == 0 and panels[0].get_xlim()[1] >= 60, "the panel that ends first hides nothing"
 
 
 def test_learning_curve_before_the_first_episode() -> None:
@@ -121,6 +123,22 @@ def test_gif_keeps_its_size_limit(tmp_path: Path) -> None:
         assert 1 < gif.n_frames < 40  # type: ignore[attr-defined]
     with pytest.raises(ValueError, match="empty"):
         write_gif(Recording("fast", 0.2), tmp_path / "none.gif")
+    with pytest.raises(ValueError, match="max_frames=0: expected 1 or more"):
+        write_gif(recording, tmp_path / "none.gif", max_frames=0)
+    assert [path.name for path in tmp_path.iterdir()] == ["noise.gif"]
+
+
+def test_images_of_foreign_sensors_are_shown_as_numbers() -> None:
+    signed = np.zeros((8, 8, 5))
+    signed[0, 0, -1], signed[0, 1, -1] = 1.0, -1.0
+    event = images({"event": signed})["event"]
+    np.testing.assert_array_equal(event[0, :3], [[255] * 3, [0] * 3, [127] * 3])  # grey; no event is in the middle
+    np.testing.assert_array_equal(images({"event": (127 * signed).astype(np.int8)})["event"], event)
+    assert images({"lidar": signed[..., -1:] > 0})["lidar"][0, :2].tolist() == [[255] * 3, [0] * 3]
+    grey = np.full((8, 8, 1), 9, np.uint8)
+    assert images({"rgb": grey})["rgb"].shape == (8, 8, 3)
+    of_the_package = images({"event": np.full((8, 8, 5), 128, np.uint8)})["event"]
+    assert (of_the_package == 255).all()  # 128 is none, on white
 
 
 def test_pyplot_stays_as_the_user_has_it(recording: Recording) -> None:

@@ -1,6 +1,7 @@
 """Pictures of the critic: its parts over an episode, the weights by weather, how re-fusion answers."""
 
 import numpy as np
+import pandas as pd
 import pytest
 from envs import RandomSensors, tiny_model, vectors_space
 from matplotlib.axes import Axes
@@ -81,6 +82,7 @@ def test_a_recorded_episode_of_vectors_can_be_drawn() -> None:
 
 
 def test_modalities_look_different_without_colours() -> None:
+    assert modality_styles(["b", "a"]) == modality_styles(["a", "b"])
     styles = modality_styles(["depth", "state", "rgb", "event"])
     assert list(styles) == ["rgb", "event", "depth", "state"]
     for part in ("colour", "line", "hatch"):
@@ -103,6 +105,21 @@ def test_weights_by_weather_are_the_means_of_its_episodes() -> None:
     assert reversed_axis.get_xticklabels()[0].get_text() == "Wet\nNoon"
     with pytest.raises(ValueError, match="empty"):
         plot_weather_weights(weights_table([]))
+
+
+def test_methods_of_other_modalities_share_a_legend() -> None:
+    rows = [
+        {"method": method, "weather": "ClearNoon", "modality": name, "weight": 1 / len(names)}
+        for method, names in (("have", ("rgb", "state")), ("lve", ("depth", "rgb", "event")))
+        for name in names
+    ]
+    figure = plot_weather_weights(pd.DataFrame(rows))
+    (legend,) = figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["rgb", "event", "depth", "state", "equal weights"]
+    handles = dict(zip(("rgb", "event", "depth", "state"), legend.legend_handles, strict=False))
+    assert to_hex(handles["depth"].get_facecolor()) == modality_colours(["depth"])["depth"].lower()  # type: ignore[union-attr]
+    levels = [float(np.asarray(axis.get_lines()[0].get_ydata())[0]) for axis in figure.axes]
+    assert levels == pytest.approx([1 / 2, 1 / 3])
 
 
 def test_convex_refusion_has_constant_slopes_that_sum_to_one() -> None:

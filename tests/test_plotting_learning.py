@@ -93,6 +93,12 @@ def test_runs_that_lag_behind_and_half_evaluations_do_not_count() -> None:
     assert curve.scores.shape == (2, 1, 2)
 
 
+def test_a_method_that_is_left_out_is_told() -> None:
+    parts = [evaluations("have", 0, [1000, 2000]), evaluations("sac", 0, [1000, 2000]).query("weather == 'noon'")]
+    with pytest.warns(UserWarning, match="'sac' has no evaluation in all 2 weathers"):
+        assert list(evaluation_curves(pd.concat(parts))) == ["have"]
+
+
 def test_runs_without_a_method_and_doubled_rows() -> None:
     rows = evaluations("have", 0, [1000]).drop(columns="method")
     assert list(evaluation_curves(rows)) == [""]

@@ -69,7 +69,7 @@ def style(method: str) -> Style:
     return STYLES.get(method) or SPARE[sum(map(ord, method)) % len(SPARE)]
 
 
-def plot_learning_curves(results: Results, reference: str = "have") -> Figure:
+def plot_progress(results: Results, reference: str = "have") -> Figure:
     """Mean over weathers against training steps: a row of panels for every few methods, a column for each measure.
 
     A line is the mean over seeds, its band reaches from the lowest to the highest of them. Only the seeds that have
@@ -92,16 +92,18 @@ def plot_learning_curves(results: Results, reference: str = "have") -> Figure:
                 _draw_curve(axis, method, curves[method], measure, method == reference)
             axis.set(xlabel="training steps", ylabel=f"{measure.label}, mean of weathers")
             axis.grid(alpha=0.3)
-            axis.set_xlim(left=0)
             axis.xaxis.set_major_formatter(EngFormatter(sep=""))
-            if measure == DISTANCE:
-                axis.set_ylim(bottom=0)
     for row in axes:
         for axis, measure in zip(row, measures, strict=True):
             _draw_drivers(axis, results["drivers"], measure)
         # the panel that shows most: a driver may be in one measure's reach and not in the other's
         handles, labels = max((axis.get_legend_handles_labels() for axis in row), key=lambda both: len(both[1]))
         row[-1].legend(handles, labels, fontsize=SMALL, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    # when all are drawn, as it ends the growing of the axes that panels share
+    axes[0, 0].set_xlim(left=0)
+    for axis, measure in zip(axes[0], measures, strict=True):
+        if measure == DISTANCE:
+            axis.set_ylim(bottom=0)
     return figure
 
 

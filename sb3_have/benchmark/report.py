@@ -181,7 +181,7 @@ class Report:
     def _curves(self) -> list[str]:
         if self.results["evaluations"].empty:
             return []
-        figure = figures.plot_learning_curves(self.results, self.reference)
+        figure = figures.plot_progress(self.results, self.reference)
         caption = (
             "Mean over weathers of the evaluations while training. Line: mean over seeds; band: from the lowest to the "
             "highest seed (no band for a single one). Number of seeds in brackets: of a method, only the seeds that "

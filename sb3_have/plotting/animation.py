@@ -14,7 +14,6 @@ from tqdm import tqdm
 
 from sb3_have.common.files import write_atomically
 from sb3_have.common.recording import Recording
-from sb3_have.envs.vision import MODALITIES
 from sb3_have.plotting.episode import images
 from sb3_have.plotting.style import modality_styles
 
@@ -27,9 +26,9 @@ DASHES = {"-": (1,), "--": (1, 1, 1, 1, 1, 1, 0, 0, 0), "-.": (1, 1, 1, 1, 1, 0,
 class Frames:
     """The frames of an animation, drawn as they are asked for.
 
-    From top to bottom: a line of facts (weather, time, speed, distance, return so far, value), the sensors' images
+    From top to bottom: facts (weather, time, speed, distance, return so far, value), the sensors' images
     side by side, a bar for the weight of each modality, and the weights up to now as curves. The picture that
-    ``render()`` gave stands before the images, unless it is made of them (HighwayVision-v0, CarlaVision-v0).
+    ``render()`` gave stands before the images, if the recording has it.
 
     :param recording: to show
     :param width: of a frame [px]
@@ -55,7 +54,9 @@ class Frames:
         tiles = self._tiles(0)
         aspect = sum(picture.shape[1] / picture.shape[0] for picture in tiles.values())
         self.tile: int = round(min((self.width - GAP * (len(tiles) - 1)) / aspect, 0.6 * self.width)) if tiles else 0
-        self._top = LINE + (self.tile + LINE if tiles else 0) + GAP  # of the bars
+        facts = max(len(self._facts(step)) for step in range(len(self)))
+        self._sensors = facts * LINE  # below the lines of facts
+        self._top = self._sensors + (self.tile + LINE if tiles else 0) + GAP  # of the bars
         height = self._top + LINE * len(self.styles) + (CHART + 2 * GAP if self.styles else 0)
         self.size = self.width, height + height % 2
         self._chart = self._curves() if self.styles else None
@@ -66,13 +67,14 @@ class Frames:
     def __getitem__(self, step: int) -> Image.Image:
         frame = Image.new("RGB", self.size, "white")
         draw = ImageDraw.Draw(frame)
-        draw.text((GAP, 1), self._facts(step), fill="black", font=self.font)
+        for row, line in enumerate(self._facts(step)):
+            draw.text((GAP, row * LINE + 1), line, fill="black", font=self.font)
         x = self._margin(step)
         for name, picture in self._tiles(step).items():
             width = round(self.tile * picture.shape[1] / picture.shape[0])
             method = Image.Resampling.NEAREST if self.tile > picture.shape[0] else Image.Resampling.BOX
-            frame.paste(Image.fromarray(picture).resize((width, self.tile), method), (x, 2 * LINE))
-            draw.text((x, LINE), name, fill="#555555", font=self.font)
+            frame.paste(Image.fromarray(picture).resize((width, self.tile), method), (x, self._sensors + LINE))
+            draw.text((max(x, GAP), self._sensors), name, fill="#555555", font=self.font)
             x += width + GAP
         for row, (name, look) in enumerate(self.styles.items()):
             self._bar(draw, self._top + row * LINE, name, look.colour, float(self.recording.weights[name][step]))
@@ -82,16 +84,15 @@ class Frames:
 
     def _tiles(self, step: int) -> dict[str, np.ndarray]:
         seen = images(self.recording.observations[step]) if self.recording.observations else {}
-        if not self.recording.pictures or (seen and set(seen) <= set(MODALITIES)):
-            return seen
-        return {"": self.recording.pictures[step], **seen}
+        return {"": self.recording.pictures[step], **seen} if self.recording.pictures else seen
 
     def _margin(self, step: int) -> int:
         """That centres the images."""
         widths: list[int] = [round(self.tile * tile.shape[1] / tile.shape[0]) for tile in self._tiles(step).values()]
         return max(0, (self.width - sum(widths) - GAP * (len(widths) - 1)) // 2)
 
-    def _facts(self, step: int) -> str:
+    def _facts(self, step: int) -> list[str]:
+        """In as many lines as the width makes necessary."""
         recording, info = self.recording, self.recording.infos[step]
         facts = [recording.weather] if recording.weather else []
         facts += [f"step {step}" if recording.seconds is None else f"{recording.times[step]:.1f} s"]
@@ -99,7 +100,14 @@ class Frames:
         facts += [f"{info['distance']:.0f} m"] if "distance" in info else []
         facts += [f"return {self.returns[step]:.1f}"] if len(self.returns) else []
         facts += [f"Q {self.q[step]:.1f}"] if self.q is not None else []
-        return " | ".join(facts)
+        lines = facts[:1]
+        for fact in facts[1:]:
+            longer = f"{lines[-1]} | {fact}"
+            if self.font.getlength(longer) <= self.width - 2 * GAP:
+                lines[-1] = longer
+            else:
+                lines.append(fact)
+        return lines
 
     def _bar(self, draw: ImageDraw.ImageDraw, top: int, name: str, colour: str, weight: float) -> None:
         draw.text((GAP, top), name, fill="black", font=self.font)
@@ -238,8 +246,10 @@ def write_gif(
     :param width: of the animation [px]
     :param max_frames: every n-th step is shown so that there are no more
     :param max_bytes: frames are left out until the file is no larger
-    :raises ValueError: if the recording is empty
+    :raises ValueError: if the recording is empty, or ``max_frames`` < 1
     """
+    if max_frames < 1:
+        raise ValueError(f"max_frames={max_frames}: expected 1 or more")
     frames = Frames(recording, width)
     stride = -(-len(frames) // max_frames)
     while True:

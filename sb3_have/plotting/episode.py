@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from sb3_have.common.recording import Recording
-from sb3_have.envs.vision import MODALITIES, compose
+from sb3_have.envs.vision import compose
 from sb3_have.plotting.style import MEDIUM, SMALL, Style, modality_styles, position
 
 FUSED = {
@@ -146,8 +146,8 @@ def images(observation: Any) -> dict[str, np.ndarray]:
     """Pictures of the image modalities of an observation, for people to look at.
 
     :param observation: of an environment; a Box is called "observation"
-    :return: by modality, uint8 (H, W, 3): the newest frame where several are stacked, other numbers than uint8 scaled
-        to what they span
+    :return: by modality, uint8 (H, W, 3): the newest frame where several are stacked (of events all, added up), other
+        numbers than uint8 scaled to what they span
     """
     parts = observation if isinstance(observation, Mapping) else {"observation": observation}
     pictures = {}
@@ -157,10 +157,11 @@ def images(observation: Any) -> dict[str, np.ndarray]:
             continue
         if image.shape[0] < min(image.shape[1:]):  # channels first
             image = image.transpose(1, 2, 0)
-        if image.dtype != np.uint8:
-            spread = float(image.max() - image.min())
-            image = (255 * (image - image.min()) / (spread or 1.0)).astype(np.uint8)
-        if name in MODALITIES:
+        coded = image.dtype == np.uint8
+        if not coded:
+            image = image.astype(float)
+            image = (255 * (image - image.min()) / (float(np.ptp(image)) or 1.0)).astype(np.uint8)
+        if coded and name in ("event", "depth"):  # as the sensors of this package write them
             pictures[name] = compose({name: image}, scale=1)
         else:
             pictures[name] = image[..., -3:] if image.shape[-1] % 3 == 0 else np.repeat(image[..., -1:], 3, axis=-1)

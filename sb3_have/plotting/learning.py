@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -35,7 +36,7 @@ def plot_learning_curve(
     by_weather: bool = False,
     references: Mapping[str, float] | None = None,
 ) -> Figure:
-    """Training episodes over environment steps: each a dot, and the mean of the latest as a line.
+    """Training episodes over training steps: each a dot, and the mean of the latest as a line.
 
     :param episodes: in order of time, from SB3's ``load_results``: ``l`` (steps) and the columns named here
     :param column: to show
@@ -60,13 +61,13 @@ def plot_learning_curve(
             axis.text(0.5, 0.5, "no episode ended yet", ha="center", transform=axis.transAxes)
         axis.set_title(name, fontsize=SMALL)
         axis.grid(alpha=0.3)
-        axis.set_xlim(left=0)
         axis.xaxis.set_major_formatter(EngFormatter(sep=""))
+    axes[0, 0].set_xlim(left=0)  # when all are drawn, as it ends the growing of the axis that they share
     for axis in axes.flat[len(groups) :]:
         axis.set_visible(False)
     handles, labels = axes[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, fontsize=SMALL, loc="outside upper center", ncols=min(5, len(labels)), frameon=False)
-    figure.supxlabel("environment steps", fontsize=10)
+    figure.supxlabel("training steps", fontsize=10)
     figure.supylabel(label, fontsize=10)
     return figure
 
@@ -128,7 +129,8 @@ def evaluation_curves(evaluations: pd.DataFrame, column: str = "return_mean") ->
         ``evaluation.csv`` of several runs joined by ``pandas.concat``; columns ``seed``, ``step``, ``weather`` and,
         if there are several methods, ``method``
     :param column: score, "return_mean" or "distance_mean"
-    :return: by method ("" without that column); runs as in :func:`whole_evaluations`, weathers as tasks
+    :return: by method ("" without that column); runs as in :func:`whole_evaluations`, weathers as tasks. A method
+        without an evaluation in all of the weathers is left out, and a warning tells
     :raises ValueError: if a method has two rows for the same seed, step and weather
     """
     if "method" not in evaluations:
@@ -140,9 +142,11 @@ def evaluation_curves(evaluations: pd.DataFrame, column: str = "return_mean") ->
         if rows.duplicated(keys).any():
             raise ValueError(f"{method!r} has several rows for the same {', '.join(keys)}: give each method a name")
         table = whole_evaluations(rows, n_weathers).sort_values(keys)
+        if table.empty:
+            warnings.warn(f"{method!r} has no evaluation in all {n_weathers} weathers: no curve", stacklevel=2)
+            continue
         shape = (table["step"].nunique(), table["seed"].nunique(), n_weathers)
-        if len(table):
-            curves[str(method)] = Curves(table["step"].unique(), table[column].to_numpy(float).reshape(shape))
+        curves[str(method)] = Curves(table["step"].unique(), table[column].to_numpy(float).reshape(shape))
     return curves
 
 

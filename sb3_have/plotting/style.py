@@ -76,9 +76,9 @@ def modality_styles(names: Iterable[str]) -> dict[str, Style]:
     return looks
 
 
-def position(name: str) -> int:
-    """Place of a modality among the others: rgb, event, depth, then those that are not known here."""
-    return MODALITIES.index(name) if name in MODALITIES else len(MODALITIES)
+def position(name: str) -> tuple[int, str]:
+    """Place of a modality among the others: rgb, event, depth, then those that are not known here by name."""
+    return MODALITIES.index(name) if name in MODALITIES else len(MODALITIES), name
 
 
 def draw_curve(

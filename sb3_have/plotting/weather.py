@@ -11,6 +11,9 @@ from matplotlib.figure import Figure
 from sb3_have.common.recording import Recording
 from sb3_have.plotting.style import MEDIUM, SMALL, Style, draw_whiskers, legend_above, modality_styles
 
+EQUAL = "equal weights"
+"""Line of a method's panel."""
+
 
 def weights_table(recordings: Iterable[Recording]) -> pd.DataFrame:
     """The weights of recorded episodes as a table.
@@ -69,8 +72,10 @@ def plot_weather_weights(
         else:
             axis.set_title(method, fontsize=MEDIUM)
     axes[-1].set_xticks(range(len(weathers)), [_broken(weather) for weather in weathers], fontsize=SMALL)
-    handles, labels = axes[0].get_legend_handles_labels()
-    legend_above(figure, [*handles[1:], handles[0]], [*labels[1:], labels[0]])  # the line of equal weights last
+    # a method may have modalities that another one has not
+    drawn = {label: handle for axis in axes for handle, label in zip(*axis.get_legend_handles_labels(), strict=True)}
+    labels = [*(name for name in styles if name in drawn), EQUAL]
+    legend_above(figure, [drawn[label] for label in labels], labels)
     return figure
 
 
@@ -95,7 +100,7 @@ def _draw_weather_weights(axis: Axes, table: pd.DataFrame, weathers: list[str], 
         )
         if shown["seeds"].max() > 1:
             draw_whiskers(axis, places, shown["lowest"], shown["highest"])
-    axis.axhline(1 / len(styles), color="0.35", linestyle=":", linewidth=1, label="equal weights")
+    axis.axhline(1 / max(1, table["modality"].nunique()), color="0.35", linestyle=":", linewidth=1, label=EQUAL)
     axis.set(ylabel="weight", ylim=(0, 1), axisbelow=True)
     axis.grid(axis="y", alpha=0.3)
 
