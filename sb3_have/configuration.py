@@ -38,15 +38,32 @@ def config_names() -> list[str]:
     return sorted(path.stem for path in config_path("havesac").parent.glob("*.yml"))
 
 
+def read_blocks(path: str | Path) -> dict[str, dict[str, Any]]:
+    """The blocks of a file, by environment id.
+
+    :raises ValueError: if it is not YAML, or of another form
+    """
+    try:
+        blocks = yaml.safe_load(Path(path).read_text())
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is not YAML: {error}") from error
+    if not isinstance(blocks, dict) or not all(isinstance(block, dict) for block in blocks.values()):
+        raise ValueError(
+            f"{path}: expected ids of environments, and under each a block of `name: value`, as zoo_configs has them"
+        )
+    return blocks
+
+
 def load_config(name: str, env_id: str) -> dict[str, Any]:
     """Hyper-parameters for an environment.
 
     :param name: see :func:`config_path`
     :param env_id: key of the block to read
     :raises KeyError: if the file has no block for it
+    :raises ValueError: if it cannot be read
     """
     path = config_path(name)
-    blocks = yaml.safe_load(path.read_text())
+    blocks = read_blocks(path)
     if env_id not in blocks:
         raise KeyError(f"{path} has no block for {env_id!r}, only for {', '.join(blocks)}")
     return dict(blocks[env_id])

@@ -14,7 +14,9 @@ These are rl_zoo3's own commands with all of their options (``-h`` lists them), 
 - ``tune`` is ``train -optimize`` with a journal file ``optuna.log`` in the log folder for a storage, and one study for
   each configuration and environment, in which any number of processes work at once. ``train --trial-id`` looks there.
 - ``policy_kwargs`` that a search draws are merged with those of the configuration; the Zoo would drop the latter.
-- ``enjoy`` looks where ``train`` saves, and does not ask an environment for pictures that has none to show.
+- ``enjoy`` looks where ``train`` saves, shows the newest training that has a model (the Zoo takes the newest folder, be
+  it that of a search), and does not ask an environment for pictures that has none to show.
+- What is wrong in the command line or the configuration is told in one line, with exit status 2.
 
 Another launcher gets the algorithms by :func:`register`.
 """
@@ -23,27 +25,31 @@ from __future__ import annotations
 
 import argparse
 import difflib
-import io
-import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
-from contextlib import redirect_stdout
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
 import gymnasium as gym
-import yaml
 from gymnasium.envs.registration import load_env_creator
 
-from sb3_have import HAVESAC, ModalityReplayBuffer
+from sb3_have import HAVESAC
 from sb3_have.common.crossq import MultiInputCrossQ
 from sb3_have.common.memory import keep_freed_memory
-from sb3_have.configuration import config_names, config_path, model_kwargs
+from sb3_have.configuration import config_names, config_path, read_blocks
 from sb3_have.train import algorithm_of
 from sb3_have.tuning import convert_havesac_params, merged, sample_havesac_params
+from sb3_have.zoo_options import (
+    eval_env_kwargs_option,
+    hyperparams_option,
+    imported,
+    policy_kwargs,
+    read_hyperparams,
+    stored,
+)
 
 COMMANDS = {"train": "rl_zoo3.train", "tune": "rl_zoo3.train", "enjoy": "rl_zoo3.enjoy"}
 INSTEAD = {
@@ -55,8 +61,7 @@ INSTEAD |= dict.fromkeys(("plot_train", "plot_from_file", "all_plots"), INSTEAD[
 ENV_ID = "HighwayVision-v0"
 OWN = ("havesac", "tqc", "crossq")
 """Algorithms with a configuration here. Not "sac": that name is SB3's in the Zoo, and ours is a method of HAVESAC."""
-DOTTED_PATH = re.compile(r"[A-Za-z_]\w*(\.\w+)+")
-SEARCH = {"n_evaluations": "3", "eval_episodes": "10"}
+SEARCH = ("--n-evaluations", "3", "--eval-episodes", "10")
 """Of a trial: with the Zoo's one evaluation of 5 episodes nothing is pruned, and noise decides."""
 
 
@@ -66,8 +71,8 @@ def register(algo: str = "havesac", config: Mapping[str, Any] | None = None) -> 
     :param algo: whose search is to keep ``policy_kwargs``
     :param config: hyper-parameters with these ``policy_kwargs``
     """
-    search = _imported("rl_zoo3.hyperparams_opt")
-    _imported("rl_zoo3").ALGOS.update(havesac=HAVESAC, crossq=MultiInputCrossQ)
+    search = imported("rl_zoo3.hyperparams_opt")
+    imported("rl_zoo3").ALGOS.update(havesac=HAVESAC, crossq=MultiInputCrossQ)
     sampler = partial(sample_havesac_params, config=config if algo == "havesac" else None)
     search.HYPERPARAMS_SAMPLER["havesac"] = sampler
     search.HYPERPARAMS_CONVERTER["havesac"] = convert_havesac_params
@@ -84,184 +89,68 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if not given or given[0] in ("-h", "--help"):
         print(__doc__)
         return
-    command, *options = given
-    if command not in COMMANDS:
-        _fail(command, INSTEAD.get(command, f"there is no such command; there are {', '.join(COMMANDS)}"))
-    module = _imported(COMMANDS[command])
-    before, sys.argv = sys.argv, [f"sb3_have.zoo {command}", *zoo_arguments(command, options)]
+    command, *words = given
     try:
-        getattr(module, COMMANDS[command].rpartition(".")[2])()
+        if command not in COMMANDS:
+            there_are = f"there is no such command; there are {', '.join(COMMANDS)}"
+            raise ValueError(INSTEAD.get(command, there_are))
+        program = imported(COMMANDS[command])
+        words = zoo_arguments(command, words)
+    except (ImportError, OSError, ValueError) as error:
+        print(f"python -m sb3_have.zoo {command}: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    before, sys.argv = sys.argv, [f"sb3_have.zoo {command}", *words]
+    try:
+        (program.enjoy if command == "enjoy" else program.train)()
     finally:
         sys.argv = before
 
 
 def zoo_arguments(command: str, given: Sequence[str]) -> list[str]:
-    """What the Zoo's command gets for what the user gave; HAVESAC is registered on the way.
+    """
+    What the Zoo's command gets for what the user gave; HAVESAC is registered on the way.
+
+    The Zoo heeds the last of an option that comes twice. So defaults stand before the user's words, and what completes
+    or replaces these behind them.
 
     :param command: "train", "tune" or "enjoy"
     :param given: the Zoo's options, and ``--method``
+    :raises ValueError: if an option makes no sense, or names what does not exist
     """
     register()
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--method")
-    known, rest = parser.parse_known_args(given)
-    if {"-h", "--help"} & set(rest):
+    own_parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    own_parser.add_argument("--method")
+    own, words = own_parser.parse_known_args(given)
+    if {"-h", "--help"} & set(words):
         print(f"--method NAME: of zoo_configs ({', '.join(config_names())}); python -m sb3_have.zoo -h says more\n")
-        return rest
-    return CommandLine(command, known.method, rest).completed()
-
-
-class CommandLine:
-    """What a user gave, to be completed for the Zoo.
-
-    :param command: "train", "tune" or "enjoy"
-    :param method: name of a configuration in ``zoo_configs``, or None
-    :param rest: the Zoo's options
-    """
-
-    def __init__(self, command: str, method: str | None, rest: Sequence[str]) -> None:
-        self.command, self.method, self.rest = command, method, list(rest)
-        self.given = _parser(command).parse_known_args(self.rest)[0]
-        self.env_id = self.given.env or ENV_ID
-        for package in self.given.gym_packages:
-            import_module(package)
-        if self.env_id not in gym.registry:
-            self.fail(f"there is no environment {self.env_id!r}{_guess(self.env_id, gym.registry)}")
-        self.conf = self._conf()
-        self.algo = self._algo()
-        if self.conf is None and self.algo in OWN and command != "enjoy":
-            self.conf = self._default_conf()
-        self.folder = self.given.folder or (f"logs/{method}" if method else "logs")
-
-    def fail(self, message: str) -> NoReturn:
-        """End the program."""
-        _fail(self.command, message)
-
-    def completed(self) -> list[str]:
-        """Options for the Zoo: the user's, and what they leave open."""
-        completed = [*self.rest, *self._unless_given(algo=self.algo, env=self.env_id)]
-        folder = "--folder" if self.command == "enjoy" else "--log-folder"
-        completed += [] if self.given.folder else [folder, self.folder]
-        if self.command == "enjoy":
-            return [*completed, *(["--no-render"] if self._has_no_pictures() else [])]
-        if self.conf is not None:
-            completed += ["--conf-file", self.conf]
-        if self.command == "tune":
-            completed += ["--optimize-hyperparameters", *self._unless_given(**SEARCH)]
-        if self.command == "tune" or self.given.trial_id is not None:
-            completed += self._unless_given(storage=self.storage, study_name=self.study_name)
-        elif self.env_id == "CarlaVision-v0" and not self.given.eval_env_kwargs:
-            completed += self._unless_given(eval_freq="-1")  # the evaluation would need a second server
-        return [*completed, *self._hyperparams()]
-
-    @property
-    def storage(self) -> str:
-        """Of the search: that was given, or a journal file."""
-        return str(self.given.storage or f"{self.folder}/optuna.log")
-
-    @property
-    def study_name(self) -> str:
-        """Of the search: that was given, or one for configuration and environment."""
-        return str(self.given.study_name or f"{Path(self.conf).stem if self.conf else self.algo}-{self.env_id}")
-
-    def _unless_given(self, **options: str) -> list[str]:
-        missing = {name: value for name, value in options.items() if getattr(self.given, name) is None}
-        return [word for name, value in missing.items() for word in (f"--{name.replace('_', '-')}", value)]
-
-    def _conf(self) -> str | None:
-        """What ``--method`` or ``-conf`` ask for: a file, or a package as the Zoo takes it."""
-        name = self.method or self.given.conf_file
-        if name is None:
-            return None
-        if self.method is None:
-            if self.given.conf_file and name.endswith((".yml", ".yaml", ".py")) and Path(name).is_file():
-                return str(name)
-            if name not in config_names() and _is_module(name):
-                return str(name)
-        elif self.given.conf_file:
-            self.fail("--method is short for -conf; give one of them")
-        if name not in config_names():
-            kind = "method" if self.method else "configuration"
-            self.fail(
-                f"there is no {kind} {name!r}{_guess(name, config_names())}; there are {', '.join(config_names())}"
-            )
-        return str(config_path(name))
-
-    def _algo(self) -> str:
-        algos, algo, conf = _imported("rl_zoo3").ALGOS, self.given.algo, self.conf or ""
-        suited = algorithm_of(conf if conf.endswith((".yml", ".yaml")) else "havesac")
-        if algo is None:
-            return suited
-        if algo not in algos:
-            is_method = algo in config_names()
-            hint = f"; it is a method of HAVESAC: --method {algo}" if is_method else _guess(algo, algos)
-            self.fail(f"there is no algorithm {algo!r}{hint}")
-        if self.method and algo != suited:
-            self.fail(f"--method {self.method} is of {suited}, not of {algo}: leave out --algo")
-        return str(algo)
-
-    def _default_conf(self) -> str | None:
-        path = config_path(self.algo)
-        env_ids = yaml.safe_load(path.read_text())
-        if self.env_id in env_ids:
-            return str(path)
-        if self.algo == "havesac":
-            self.fail(
-                f"{path} has no block for {self.env_id!r}, only for {', '.join(env_ids)}; copy one into a file of your "
-                "own, under that name, and give it by -conf"
-            )
-        return None  # the Zoo has its own
-
-    def _has_no_pictures(self) -> bool:
-        creator = gym.spec(self.env_id).entry_point
-        metadata = getattr(load_env_creator(creator) if isinstance(creator, str) else creator, "metadata", {})
-        return not self.given.no_render and metadata.get("render_modes") == []
-
-    def _hyperparams(self) -> list[str]:
-        """What the Zoo would not understand in the configuration, or lose, as options of its own."""
-        manager, given = self._manager(), _stored(self.given.hyperparams)
-        try:
-            with redirect_stdout(io.StringIO()):
-                hyperparams, _ = manager.read_hyperparameters()
-            params = _in_python(hyperparams)
-        except ValueError as error:
-            self.fail(str(error))
-        # As sb3_have.train does: less memory than SB3's buffer takes for stacked images
-        n_stack, has_buffer = hyperparams.get("frame_stack") or 1, "replay_buffer_class" in hyperparams
-        if self.algo in ("tqc", "crossq") and n_stack > 1 and not has_buffer and hyperparams.get("n_steps", 1) == 1:
-            params["replay_buffer_class"] = repr(_expression(ModalityReplayBuffer))
-            params["replay_buffer_kwargs"] = repr({"n_stack": n_stack, **hyperparams.get("replay_buffer_kwargs", {})})
-        if self.command == "tune" or self.given.trial_id is not None:
-            register(self.algo, {**hyperparams, "policy_kwargs": _policy_kwargs(hyperparams)})
-            params.pop("policy_kwargs", None)  # as part of what is drawn
-            if self.algo not in _imported("rl_zoo3.hyperparams_opt").HYPERPARAMS_SAMPLER:
-                self.fail(f"the Zoo has no search for {self.algo!r}")
-        if self.given.trial_id == 0:  # to the Zoo that is none
-            trial = manager.load_trial(self.storage, self.study_name, 0)
-            params |= {key: _expression(value) for key, value in trial.items() if key not in given}
-        return [
-            *_option("--hyperparams", self.given.hyperparams, params),
-            *self._eval_env_kwargs(hyperparams),
-        ]
-
-    def _manager(self) -> Any:
-        """The Zoo's reader of configurations."""
-        manager = _imported("rl_zoo3.exp_manager").ExperimentManager
-        return manager(
-            self.given,
-            self.algo,
-            self.env_id,
-            self.folder,
-            hyperparams=_stored(self.given.hyperparams),
-            env_kwargs=_stored(self.given.env_kwargs),
-            config=self.conf,
+        return words
+    options = _parser(command).parse_known_args(words)[0]
+    _import(options.gym_packages)
+    options.env = options.env or ENV_ID
+    if options.env not in gym.registry:
+        raise ValueError(
+            f"there is no environment {options.env!r}{_guess(options.env, gym.registry)}; --gym-packages imports "
+            "packages that register others"
         )
+    options.conf_file = _configuration(own.method, options.conf_file)
+    options.algo = _algorithm(own.method, options.algo, options.conf_file)
+    options.folder = options.folder or (f"logs/{own.method}" if own.method else "logs")
+    defaults = ["--algo", options.algo, "--env", options.env]
+    if command == "enjoy":
+        return [*defaults, "--folder", options.folder, *words, *_enjoy_options(options)]
 
-    def _eval_env_kwargs(self, hyperparams: Mapping[str, Any]) -> list[str]:
-        given = _stored(self.given.eval_env_kwargs)
-        configured = hyperparams.get("env_kwargs", _stored(self.given.env_kwargs))
-        missing = {key: _expression(value) for key, value in configured.items() if key not in given}
-        return _option("--eval-env-kwargs", self.given.eval_env_kwargs, missing)
+    options.conf_file = options.conf_file or _default_configuration(options.algo, options.env)
+    name = Path(options.conf_file).stem if options.conf_file else options.algo
+    options.storage = options.storage or f"{options.folder}/optuna.log"
+    options.study_name = options.study_name or f"{name}-{options.env}"
+    defaults += ["--log-folder", options.folder]
+    if command == "tune" or options.trial_id is not None:
+        defaults += ["--storage", options.storage, "--study-name", options.study_name]
+    if command == "tune":
+        defaults += ["--optimize-hyperparameters", *SEARCH]
+    elif options.env == "CarlaVision-v0" and not options.eval_env_kwargs:
+        defaults += ["--eval-freq", "-1"]  # the evaluation would need a second server
+    return [*defaults, *words, *_training_options(command, options)]
 
 
 def _parser(command: str) -> argparse.ArgumentParser:
@@ -272,62 +161,114 @@ def _parser(command: str) -> argparse.ArgumentParser:
     parser.add_argument("--gym-packages", nargs="+", default=[])
     parser.add_argument("-f", "--folder" if command == "enjoy" else "--log-folder", dest="folder")
     parser.add_argument("--env-kwargs", nargs="+", default=[])
-    parser.set_defaults(conf_file=None)
     if command == "enjoy":
+        parser.set_defaults(conf_file=None)
         parser.add_argument("--no-render", action="store_true")
+        parser.add_argument("--exp-id", type=int, default=0)
+        parser.add_argument("--load-best", action="store_true")
+        parser.add_argument("--load-checkpoint", type=int)
+        parser.add_argument("--load-last-checkpoint", action="store_true")
         return parser
     parser.add_argument("-conf", "--conf-file")
     parser.add_argument("-params", "--hyperparams", nargs="+", default=[])
     parser.add_argument("--eval-env-kwargs", nargs="+", default=[])
     parser.add_argument("--trial-id", type=int)
-    for option in ("--eval-freq", "--eval-episodes", "--n-evaluations", "--storage", "--study-name"):
-        parser.add_argument(option)
+    parser.add_argument("--storage")
+    parser.add_argument("--study-name")
     return parser
 
 
-def _stored(words: Sequence[str]) -> dict[str, Any]:
-    """Of ``name:value ...``, as the Zoo reads it."""
-    namespace = argparse.Namespace()
-    _imported("rl_zoo3.utils").StoreDict([], "stored")(None, namespace, words)
-    return dict(namespace.stored)
+def _import(packages: Iterable[str]) -> None:
+    for package in packages:
+        try:
+            import_module(package)
+        except ImportError as error:
+            raise ValueError(f"--gym-packages {package} cannot be imported ({error}); is it installed?") from error
 
 
-def _option(name: str, given: Sequence[str], more: Mapping[str, str]) -> list[str]:
-    """The option again, with more in it; the Zoo heeds the last one only."""
-    return [name, *given, *(f"{key}:{value}" for key, value in more.items())] if more else []
+def _configuration(method: str | None, conf_file: str | None) -> str | None:
+    """What ``--method`` or ``-conf`` ask for: a file, or a package as the Zoo takes it."""
+    if method and conf_file:
+        raise ValueError("--method is short for -conf; give one of them")
+    name = method or conf_file
+    if name is None:
+        return None
+    if name in config_names():
+        return str(config_path(name))
+    if not method and (Path(name).is_file() if name.endswith((".yml", ".yaml", ".py")) else _is_module(name)):
+        return name
+    raise ValueError(
+        f"there is no {'method' if method else 'configuration'} {name!r}{_guess(name, config_names())}; there are "
+        f"{', '.join(config_names())}"
+    )
 
 
-def _in_python(hyperparams: Mapping[str, Any]) -> dict[str, str]:
-    """Those values that hold dotted paths of classes, as Python: where the Zoo evaluates a string, as Python in one."""
-    left_to_the_zoo = {"policy", "env_wrapper", "vec_env_wrapper", "callback", "env_kwargs"}
-    given = {key: value for key, value in hyperparams.items() if key not in left_to_the_zoo and not _is_python(value)}
-    resolved = {key: value for key, value in model_kwargs(given).items() if value != given[key]}
-    evaluated = {"policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs"}
-    expressions = {key: _expression(value) for key, value in resolved.items()}
-    return {key: repr(text) if key in evaluated else text for key, text in expressions.items()}
+def _default_configuration(algo: str, env_id: str) -> str | None:
+    """Of an algorithm; None where the Zoo has its own."""
+    if algo not in OWN:
+        return None
+    path = config_path(algo)
+    env_ids = read_blocks(path)
+    if env_id in env_ids:
+        return str(path)
+    if algo == "havesac":
+        raise ValueError(
+            f"{path} has no block for {env_id!r}, only for {', '.join(env_ids)}; copy one into a file of your own, "
+            "under that name, and give it by -conf"
+        )
+    return None
 
 
-def _is_python(value: Any) -> bool:
-    """Whether it is a string that only the Zoo can read."""
-    return isinstance(value, str) and not DOTTED_PATH.fullmatch(value)
+def _algorithm(method: str | None, algo: str | None, conf: str | None) -> str:
+    """The given one, or that of the configuration."""
+    algos = imported("rl_zoo3").ALGOS
+    suited = algorithm_of(conf if conf and conf.endswith((".yml", ".yaml")) else "havesac")
+    if algo is None:
+        return suited
+    if algo in config_names() and algo not in algos:
+        raise ValueError(f"there is no algorithm {algo!r}; it is a method of HAVESAC: --method {algo}")
+    if algo not in algos:
+        raise ValueError(f"there is no algorithm {algo!r}{_guess(algo, algos)}; there are {', '.join(algos)}")
+    if method and algo != suited:
+        raise ValueError(f"--method {method} is of {suited}, not of {algo}: leave out --algo")
+    return algo
 
 
-def _expression(value: Any) -> str:
-    """Python for a value of a configuration, which needs no import before it."""
-    if isinstance(value, type):
-        return f"__import__({value.__module__!r}, fromlist=[{value.__qualname__!r}]).{value.__qualname__}"
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key!r}: {_expression(item)}" for key, item in value.items()) + "}"
-    if isinstance(value, list):
-        return "[" + ", ".join(map(_expression, value)) + "]"
-    return repr(value)
+def _training_options(command: str, options: argparse.Namespace) -> list[str]:
+    """What ``train`` and ``tune`` get behind the user's words."""
+    hyperparams = read_hyperparams(options)
+    is_search = command == "tune" or options.trial_id is not None
+    if is_search:
+        register(options.algo, {**hyperparams, "policy_kwargs": policy_kwargs(hyperparams)})
+        if options.algo not in imported("rl_zoo3.hyperparams_opt").HYPERPARAMS_SAMPLER:
+            raise ValueError(f"the Zoo has no search for {options.algo!r}")
+    return [
+        *(["--conf-file", options.conf_file] if options.conf_file else []),
+        *hyperparams_option(options, hyperparams, is_search),
+        *eval_env_kwargs_option(options, hyperparams),
+    ]
 
 
-def _policy_kwargs(hyperparams: Mapping[str, Any]) -> dict[str, Any]:
-    given = hyperparams.get("policy_kwargs") or {}
-    if isinstance(given, str):  # in the names that the Zoo has there
-        given = eval(given, vars(_imported("rl_zoo3.exp_manager")).copy())
-    return dict(model_kwargs({"policy_kwargs": given})["policy_kwargs"])
+def _enjoy_options(options: argparse.Namespace) -> list[str]:
+    """What ``enjoy`` gets behind the user's words. The newest folder may be a search's, which has no model."""
+    stored("--env-kwargs", options.env_kwargs)  # explains a mistake in them
+    entry_point = gym.spec(options.env).entry_point
+    creator: Any = load_env_creator(entry_point) if isinstance(entry_point, str) else entry_point
+    has_pictures = getattr(creator, "metadata", {}).get("render_modes") != []
+    words = [] if has_pictures or options.no_render else ["--no-render"]
+    if "rl-trained-agents" in options.folder:  # the Zoo downloads what is missing there
+        return words
+    utils, name = imported("rl_zoo3.utils"), imported("huggingface_sb3").EnvironmentName(options.env)
+    newest = utils.get_latest_run_id(f"{options.folder}/{options.algo}", name)
+    which = (options.load_best, options.load_checkpoint, options.load_last_checkpoint)
+    missing = []
+    for exp_id in [options.exp_id] if options.exp_id else [*range(newest, 0, -1), -1]:
+        try:
+            utils.get_model_path(exp_id, options.folder, options.algo, name, *which)
+            return [*words, "--exp-id", str(exp_id)]
+        except (AssertionError, ValueError) as error:
+            missing.append(str(error))
+    raise ValueError(f"{missing[0]}; `train` with the same options saves one, -f and --exp-id name others")
 
 
 def _is_module(name: str) -> bool:
@@ -338,19 +279,8 @@ def _is_module(name: str) -> bool:
 
 
 def _guess(name: str, known: Iterable[str]) -> str:
-    return "".join(f"; did you mean {match!r}?" for match in difflib.get_close_matches(name, list(known), n=1))
-
-
-def _imported(module: str) -> Any:
-    try:
-        return import_module(module)
-    except ImportError as error:
-        raise ImportError(f'{module} cannot be imported ({error}): pip install "sb3_have[zoo]"') from error
-
-
-def _fail(command: str, message: str) -> NoReturn:
-    print(f"python -m sb3_have.zoo {command}: {message}", file=sys.stderr)
-    sys.exit(2)
+    matches = difflib.get_close_matches(name, list(known), n=1, cutoff=0.75)
+    return "".join(f"; did you mean {match!r}?" for match in matches)
 
 
 if __name__ == "__main__":

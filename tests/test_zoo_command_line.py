@@ -34,6 +34,11 @@ def single(arguments: list[str], *names: str) -> str | None:
     return None if words is None else " ".join(words)
 
 
+def keeps(arguments: list[str], words: list[str]) -> bool:
+    """Whether these are among them, in their order."""
+    return any(arguments[i : i + len(words)] == words for i in range(len(arguments) + 1 - len(words)))
+
+
 @pytest.mark.parametrize(
     ("given", "algo", "conf", "folder"),
     [
@@ -54,7 +59,7 @@ def single(arguments: list[str], *names: str) -> str | None:
 def test_configuration_and_algorithm(given: list[str], algo: str, conf: str | None, folder: str) -> None:
     arguments = zoo_arguments("train", given)
     kept = given[2:] if given[:1] == ["--method"] else given
-    assert arguments[: len(kept)] == kept
+    assert keeps(arguments, kept)
     assert single(arguments, "--algo") == algo
     assert single(arguments, "--conf-file") == (None if conf is None else str(config_path(conf)))
     assert single(arguments, "-f", "--log-folder") == folder
@@ -102,7 +107,7 @@ def test_evaluation_has_the_env_kwargs_of_the_configuration() -> None:
 def test_options_of_the_user_stay() -> None:
     given = ["-params", "gamma:0.5", "policy_kwargs:dict(net_arch=[8])", "-n", "7", "--track", "-P", "--eval-freq", "3"]
     arguments = zoo_arguments("train", ["--method", "tqc", *given])
-    assert arguments[: len(given)] == given
+    assert keeps(arguments, given)
     assert option(arguments, "--eval-freq") == ["3"]
     params = option(arguments, "-params", "--hyperparams")
     assert params is not None and params[:2] == ["gamma:0.5", "policy_kwargs:dict(net_arch=[8])"]
@@ -163,12 +168,30 @@ def test_classes_in_own_configurations(policy_kwargs: Any, tmp_path: Path, capsy
         (["train", "--method", "lve", "-conf", "lve"], "give one of them"),
         (["train", "-conf", "heve"], "no configuration 'heve'; did you mean 'have'?"),
         (["train", "-conf", "nowhere/lve.yml"], "no configuration 'nowhere/lve.yml'"),
+        (["train", "--env", "MyDrive-v0"], "no environment 'MyDrive-v0'; --gym-packages imports packages"),
         (["train", "--env", "HighwayVison-v0"], "no environment 'HighwayVison-v0'; did you mean 'HighwayVision-v0'?"),
         (["enjoy", "--env", "HighwayVison-v0"], "zoo enjoy: there is no environment"),
         (["train", "--env", "Pendulum-v1"], "no block for 'Pendulum-v1', only for HighwayVision-v0, Carla"),
         (["train", "--method", "rgb", "--env", VECTORS], "Hyperparameters not found for havesac-ReliabilityDrive-v0"),
         (["train", "-params", "replay_buffer_class:'sb3_have.Nothing'"], "no replay_buffer_class 'sb3_have.Nothing'"),
         (["tune", "--method", "crossq"], "no search for 'crossq'"),
+        (["train", "--gym-packages", "nopkg"], "--gym-packages nopkg cannot be imported"),
+        (["train", "-params", "gamma"], "-params gamma: expected NAME:VALUE with a value in Python"),
+        (
+            ["train", "-params", "tau:0.1", "ent_coef:auto"],
+            "-params ent_coef:auto: .*ent_coef:'auto_0.1'.*NameError",
+        ),
+        (["train", "--eval-env-kwargs", "port:"], "--eval-env-kwargs port:: expected NAME:VALUE"),
+        (["enjoy", "--env-kwargs", "weather:WetNoon"], "--env-kwargs weather:WetNoon: expected NAME:VALUE"),
+        (
+            ["enjoy", "-f", "nowhere"],
+            "The nowhere/havesac folder was not found; `train` with the same options saves one",
+        ),
+        (
+            ["enjoy", "--method", "lve", "-f", "nowhere", "--exp-id", "3"],
+            "nowhere/havesac/HighwayVision-v0_3 folder was",
+        ),
+        (["train", "--env", VECTORS, "--trial-id", "7", "-f", "nowhere"], "no nowhere/optuna.log; `tune` writes it"),
         (["plots"], "sb3_have.benchmark report"),
         (["push_to_hub", "--algo", "havesac"], "upload"),
         (["trian"], "there is no such command; there are train, tune, enjoy"),
@@ -182,6 +205,44 @@ def test_mistakes_are_explained(given: list[str], message: str, capsys: pytest.C
     assert re.search(message.replace("?", r"\?"), printed), printed
 
 
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "expected ids of environments"),
+        (f"{VECTORS}:", "expected ids of environments"),
+        ("gamma: 0.5", "expected ids of environments"),
+        (f"{VECTORS}: {{gamma: [1}}", "is not YAML: while parsing"),
+        ("\ta: b", "is not YAML: while scanning"),
+    ],
+)
+def test_configurations_that_are_none(
+    content: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.yml").write_text(content)
+    with pytest.raises(SystemExit) as end:
+        zoo.main(["train", "-conf", str(tmp_path / "mine.yml"), "--env", VECTORS])
+    printed = capsys.readouterr().err
+    assert end.value.code == 2 and printed.count("\n") == 1
+    assert f"{tmp_path / 'mine.yml'}" in printed and message in printed
+
+
+def test_model_of_the_newest_training_is_shown(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A search and a training that was killed leave folders without one."""
+    given = ["--env", VECTORS, "-f", str(tmp_path)]
+    for number, files in {1: [f"{VECTORS}.zip"], 2: [f"{VECTORS}.zip", "best_model.zip"], 10: []}.items():
+        folder = tmp_path / "havesac" / f"{VECTORS}_{number}"
+        folder.mkdir(parents=True)
+        for name in files:
+            (folder / name).touch()
+    assert option(zoo_arguments("enjoy", given), "--exp-id") == ["2"]
+    assert option(zoo_arguments("enjoy", [*given, "--exp-id", "1"]), "--exp-id") == ["1"]
+    assert option(zoo_arguments("enjoy", [*given, "--load-best"]), "--exp-id") == ["2"]
+    with pytest.raises(ValueError, match=rf"No model found .*{VECTORS}_1.best_model.zip"):
+        zoo_arguments("enjoy", [*given, "--load-best", "--exp-id", "1"])
+    with pytest.raises(ValueError, match=rf"No model found .*{VECTORS}_10.rl_model_5_steps.zip"):
+        zoo_arguments("enjoy", [*given, "--load-checkpoint", "5"])
+
+
 def test_help(capsys: pytest.CaptureFixture[str]) -> None:
     zoo.main(["--help"])
     assert "python -m sb3_have.zoo tune" in capsys.readouterr().out
@@ -191,14 +252,15 @@ def test_help(capsys: pytest.CaptureFixture[str]) -> None:
     assert "--method NAME" in printed and "lve-paper" in printed and "--n-eval-envs" in printed
 
 
-def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """As on a clean install of rl_zoo3, whose ``enjoy`` needs requests without saying so."""
     for module in ("rl_zoo3.enjoy", "rl_zoo3.load_from_hub"):
         monkeypatch.delitem(sys.modules, module, raising=False)
     for module in ("requests", "requests.exceptions"):
         monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(ImportError, match=r"requests.*pip install \"sb3_have\[zoo\]\""):
+    with pytest.raises(SystemExit):
         zoo.main(["enjoy"])
+    assert re.search(r"requests.*pip install \"sb3_have\[zoo\]\"", capsys.readouterr().err)
 
 
 def test_command_line_is_given_back(monkeypatch: pytest.MonkeyPatch) -> None:

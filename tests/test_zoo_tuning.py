@@ -124,6 +124,9 @@ def test_search_keeps_policy_kwargs(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert (kwargs["gamma"], kwargs["local_coef"]) == (drawn["gamma"], drawn["local_coef"])
         assert (kwargs["tau"], kwargs["buffer_size"]) == (0.5, 40)
         assert saved(folder, "args.yml")["study_name"] == f"lve-{VECTORS}"
+    for unknown in (["--trial-id", "2"], ["--trial-id", "0", "--study-name", "another"]):
+        with pytest.raises(ValueError, match=rf"--trial-id {unknown[1]}: .*optuna.log has no such trial of a study"):
+            zoo.zoo_arguments("train", [*given, "--env", VECTORS, *unknown])
 
 
 def test_search_for_tqc_keeps_the_encoders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,11 +155,12 @@ def test_defaults_of_a_search() -> None:
         ["--n-evaluations", "3"],
         ["--eval-episodes", "10"],
     ):
-        assert arguments[arguments.index(words[0]) + 1] == words[1]
+        assert arguments.count(words[0]) == 1 and arguments[arguments.index(words[0]) + 1] == words[1]
     assert "--optimize-hyperparameters" in arguments
     own = ["--storage", "postgresql://user@host/optuna", "--study-name", "mine", "--eval-episodes", "2"]
     arguments = zoo.zoo_arguments("tune", ["--algo", "havesac", "--env", VECTORS, *own])
-    assert [arguments.count(word) for word in own[::2]] == [1, 1, 1]
+    # the last of each is heeded
+    assert [arguments[len(arguments) - arguments[::-1].index(word)] for word in own[::2]] == own[1::2]
 
 
 def test_two_processes_share_a_study(tmp_path: Path) -> None:
