@@ -7,6 +7,7 @@ here is preceded by ``<!-- not executed: REASON -->``, with one of the reasons b
 import argparse
 import configparser
 import importlib.util
+import inspect
 import os
 import random
 import re
@@ -23,11 +24,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 import torch as th
+import yaml
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from test_mujoco import missing as missing_for_mujoco
 
 import sb3_have.plotting
 import sb3_have.sensors
+from sb3_have import HAVESAC, MultiModalPolicy
+from sb3_have.configuration import env_wrapper
 from sb3_have.sensors import EVENT_DTYPE, write_events
 
 ROOT = Path(__file__).parent.parent
@@ -60,6 +64,10 @@ def blocks(page: Path) -> list[Block]:
         line = text.count("\n", 0, match.start("body"))
         found.append(Block(match["info"].strip(), match["body"], line, said[1] if said else None))
     return found
+
+
+def pages_with(language: str) -> list[Path]:
+    return [page for page in PAGES if any(block.language == language for block in blocks(page))]
 
 
 def prose(page: Path) -> str:
@@ -102,9 +110,7 @@ PREPARATIONS = {"docs/sensors.md": write_recording}
 
 
 @pytest.mark.filterwarnings("ignore:The replay buffer's frames will take")  # the machine's memory is not the page's
-@pytest.mark.parametrize(
-    "page", [page for page in PAGES if any(b.language == "python" for b in blocks(page))], ids=name_of
-)
+@pytest.mark.parametrize("page", pages_with("python"), ids=name_of)
 def test_python_blocks_run(page: Path, small_budget: None, tmp_path: Path) -> None:
     python = [block for block in blocks(page) if block.language == "python" and block.reason is None]
     if any("MUJOCO_GL" in block.text for block in python) and (reason := missing_for_mujoco()):
@@ -123,6 +129,23 @@ def test_only_what_cannot_run_here_is_left_out() -> None:
     assert len(comments) == sum(block.reason is not None for page in PAGES for block in blocks(page)), comments
     languages = {block.language.split()[0] for page in PAGES for block in blocks(page)}
     assert languages <= {"python", "bash", "yaml", "bibtex", "{toctree}", "{eval-rst}", "{include}"}, languages
+
+
+@pytest.mark.parametrize("page", pages_with("yaml"), ids=name_of)
+def test_yaml_blocks_are_configurations(page: Path) -> None:
+    for_others = {"n_timesteps", "n_envs", "frame_stack", "env_kwargs", "env_wrapper"}
+    known = for_others | inspect.signature(HAVESAC).parameters.keys()
+    of_policy = set(inspect.signature(MultiModalPolicy).parameters)
+    for block in blocks(page):
+        if block.language == "yaml":
+            read = yaml.safe_load(block.text)
+            config = read if "env_wrapper" in read else next(iter(read.values()))
+            assert config.keys() <= known and config.get("policy_kwargs", {}).keys() <= of_policy, block.text
+            assert "env_wrapper" not in config or env_wrapper(config) is not None
+
+
+def test_citation_has_the_version() -> None:
+    assert f"version = {{{sb3_have.__version__}}}" in (ROOT / "docs" / "citation.md").read_text()
 
 
 def commands(page: Path) -> list[str]:

@@ -1,11 +1,13 @@
 """The notebooks run from top to bottom on a small budget, find the package, and hold no outputs."""
 
+import ast
 import importlib.util
 import json
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import nbformat
@@ -83,9 +85,9 @@ def test_is_stripped_and_tidy(path: Path) -> None:
 
 
 @each
-@pytest.mark.parametrize("where", ["installed", "checkout", "elsewhere"])
+@pytest.mark.parametrize("where", ["installed", "checkout", "Colab", "elsewhere"])
 def test_first_cell_finds_the_package(path: Path, where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It installs only where there is nothing to import, as in Colab, and needs no network in a checkout."""
+    """It installs in Colab alone, if there is nothing to import, and needs no network in a checkout."""
     installed = []
 
     class Shell:
@@ -95,13 +97,15 @@ def test_first_cell_finds_the_package(path: Path, where: str, tmp_path: Path, mo
     code = TransformerManager().transform_cell(setup_of(path))  # type: ignore[no-untyped-call]
     before = list(sys.path)
     with monkeypatch.context() as patch:
-        patch.chdir(tmp_path if where == "elsewhere" else FOLDER)
+        patch.chdir(tmp_path if where in ("Colab", "elsewhere") else FOLDER)
         patch.setattr(sys, "path", list(before))
         if where != "installed":
             patch.setattr(importlib.util, "find_spec", lambda name: None)
+        if where == "Colab":
+            patch.setitem(sys.modules, "google.colab", ModuleType("google.colab"))
         exec(code, {"get_ipython": Shell})
         after = list(sys.path)
-    assert installed == ([("pip", "install --quiet sb3_have")] if where == "elsewhere" else [])
+    assert installed == ([("pip", "install --quiet sb3_have")] if where == "Colab" else [])
     assert after == ([str(FOLDER.parent.resolve())] if where == "checkout" else []) + before
 
 
@@ -114,6 +118,15 @@ def test_takes_its_budget_from_the_environment(path: Path) -> None:
     assert (".learn(" in code) == trains
     assert ('os.environ.get("SB3_HAVE_NOTEBOOK_STEPS", ' in code) == trains
     assert ("`SB3_HAVE_NOTEBOOK_STEPS`" in introduction) == trains
+
+
+@each
+def test_uses_what_is_public(path: Path) -> None:
+    code = "\n".join("".join(cell["source"]) for cell in code_of(path))
+    tree = ast.parse(TransformerManager().transform_cell(code))  # type: ignore[no-untyped-call]
+    used = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute)]
+    private = [node for node in used if node.attr.startswith("_") and not node.attr.startswith("__")]
+    assert {ast.unparse(node.value) for node in private} <= {"self"}, [ast.unparse(node) for node in private]
 
 
 @pytest.mark.parametrize("command", [["check"], ["format", "--check"]], ids=lambda command: command[0])
