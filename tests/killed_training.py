@@ -78,15 +78,16 @@ def make_env() -> VecEnv:
     return VecNormalize(DummyVecEnv([lambda: Monitor(Mortal())]))
 
 
-def train(folder: Path, moment: str = "never", number: int = 0) -> SAC:
+def train(folder: Path, moment: str = "never", number: int = 0, keep: int = 2) -> SAC:
     """Train to the end, from the newest checkpoint if there is one.
 
     :param folder: of the checkpoints
     :param moment: "step", "byte", "before renaming" or "after renaming", when it dies
     :param number: of the step, byte or checkpoint, from here
+    :param keep: how many checkpoints stay
     """
     prepare(moment, number)
-    callback = ResumableCheckpointCallback(folder, SAVE_FREQ)
+    callback = ResumableCheckpointCallback(folder, SAVE_FREQ, keep)
     env = make_env()
     if checkpoints(folder):
         model: SAC = load_checkpoint(folder, env, callback, device="cpu")

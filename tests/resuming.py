@@ -84,7 +84,9 @@ def assert_resumes(
     for env in (first.get_env(), first_env):
         env.close()  # type: ignore[union-attr]
 
-    checkpoint = checkpoints(folder)[0]
+    checkpoint, *later = checkpoints(folder)
+    for path in later:
+        path.unlink()
     np.random.rand(7), th.rand(7)  # another process
     going_on = callbacks()
     second: OffPolicyAlgorithm = load_checkpoint(checkpoint, make_env(), going_on, device="cpu")

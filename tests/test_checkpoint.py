@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from envs import TINY, RandomSensors, vectors_space
-from gymnasium.wrappers import TransformReward
+from gymnasium.wrappers import TimeLimit, TransformReward
 from resuming import Drifting, assert_resumes, assert_same, everything
 from sb3_contrib import TQC
 from stable_baselines3 import SAC, TD3, HerReplayBuffer
@@ -20,7 +20,7 @@ from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize
 
 from sb3_have import HAVESAC, DeepMDPCallback
-from sb3_have.common.checkpoint import ResumableCheckpointCallback, load_checkpoint, save_checkpoint
+from sb3_have.common.checkpoint import ResumableCheckpointCallback, checkpoints, load_checkpoint, save_checkpoint
 from sb3_have.common.crossq import MultiInputCrossQ
 from sb3_have.common.env_state import ResumableEnv, environments_state, restore_environments
 
@@ -157,6 +157,7 @@ def test_worker_processes_that_are_others() -> None:
         return SubprocVecEnv([make])
 
     inner, whole, bare = workers(ResumableEnv, Monitor), workers(Monitor, ResumableEnv), workers(ResumableEnv)
+    shorter, longer = (workers(partial(TimeLimit, max_episode_steps=steps), ResumableEnv) for steps in (5, 6))
     assert len(environments_state(inner).lost) == 1, "Monitor's state would be missing"
     state = environments_state(whole)
     assert state.lost == []
@@ -164,7 +165,10 @@ def test_worker_processes_that_are_others() -> None:
         restore_environments(inner, state)
     with pytest.raises(ValueError, match="ResumableEnv > Monitor > Drifting, and it was given ResumableEnv > Drifting"):
         restore_environments(bare, state)
-    for env in (inner, whole, bare):
+    shorter.reset()
+    with pytest.raises(ValueError, match=r"max_episode_steps: 5, .* max_episode_steps: 6"):
+        restore_environments(longer, environments_state(shorter))
+    for env in (inner, whole, bare, shorter, longer):
         env.reset()
         env.close()
 
@@ -189,13 +193,13 @@ def test_training_that_a_callback_ends(tmp_path: Path) -> None:
             return self.num_timesteps < 25
 
     sac(drifting()).learn(40, [ResumableCheckpointCallback(tmp_path, 10), Ends()])
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["checkpoint-10", "checkpoint-20"]
+    assert [path.name for path in checkpoints(tmp_path)] == ["checkpoint-10", "checkpoint-20"]
 
 
 def test_saving_does_not_disturb(tmp_path: Path) -> None:
     without = everything(sac(drifting(), use_sde=True).learn(40))
     saving = sac(drifting(), use_sde=True).learn(40, ResumableCheckpointCallback(tmp_path, 5))
-    assert len([*tmp_path.iterdir()]) == 2
+    assert len(checkpoints(tmp_path)) == 2
     assert_same(everything(saving), without)
 
 

@@ -3,6 +3,7 @@
 import random
 import threading
 from collections import deque
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -135,6 +136,16 @@ def test_what_the_old_state_has_computed_is_forgotten() -> None:
     first.reset()
     restore_environments(second, environments_state(first))
     assert not hasattr(second.unwrapped.envs[0].unwrapped, "cached")  # type: ignore[attr-defined]
+
+
+def test_settings_stay_where_there_is_no_state() -> None:
+    """A simulator may be on another port by now."""
+    first, second = (DummyVecEnv([partial(TimeLimit, Connected(), steps)]) for steps in (5, 7))
+    first.reset()
+    state = environments_state(first)
+    assert len(state.lost) == 2
+    restore_environments(second, state)
+    assert second.get_attr("_max_episode_steps") == [7]
 
 
 def test_other_environments_are_refused(tmp_path: Path) -> None:

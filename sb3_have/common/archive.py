@@ -88,12 +88,13 @@ def write_archive(path: Path, info: Mapping[str, Any], model: memoryview, state:
 
     Large arrays are written from where they lie, so that this takes hardly any memory.
 
-    :param path: of the file
+    :param path: of the file; its folder is made where it is missing
     :param info: small, in JSON
     :param model: the model's own file
     :param state: to pickle
     :raises OSError: if it cannot be written, as on a full disk; nothing is left of it then
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_name(f"{path.name}.partial")
     try:
         with open(unfinished, "wb") as file:
@@ -202,4 +203,6 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
     except (*DAMAGES, OSError) as error:
         if isinstance(error, OSError) and error.errno not in (errno.EINVAL, errno.EIO, None):
             raise  # there is no such file, or it may not be read
-        raise DamagedCheckpointError(f"{path} is damaged ({error}); remove it and go on from another one") from error
+        raise DamagedCheckpointError(
+            f"{path} is damaged or no checkpoint at all ({error}); go on from another one"
+        ) from error

@@ -2,34 +2,30 @@
 
 from __future__ import annotations
 
-import inspect
 import io
 import os
 import random
 import re
 import warnings
-from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from types import MethodType
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import torch as th
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_have.common.archive import DamagedCheckpointError, check_archive, read_archive, read_info, write_archive
+from sb3_have.common.callback_state import Callbacks, callbacks_state, restore_callbacks
 from sb3_have.common.env_state import environments_state, restore_environments
-
-Callbacks = BaseCallback | Sequence[BaseCallback] | None
-
-PLAIN = (bool, int, float, complex, str, bytes, np.ndarray, np.generic, th.Tensor, type(None))
-PLAIN_RANDOM = (np.random.Generator, np.random.RandomState, random.Random)
-CONTAINERS = (list, tuple, set, frozenset, deque)
+from sb3_have.common.files import locked
+from sb3_have.common.replay_state import at_full_size, end_last_episode, filled_part
 
 
 def save_checkpoint(
@@ -37,7 +33,7 @@ def save_checkpoint(
     path: str | os.PathLike[str],
     callbacks: Callbacks = None,
     info: Mapping[str, Any] | None = None,
-    rollout_started: bool = False,
+    rollout_started: bool | None = None,
 ) -> None:
     """Write all that the further training depends on into one file, which appears whole or not at all.
 
@@ -61,9 +57,14 @@ def save_checkpoint(
         and containers of such) and no parameter of the constructor; those with ``get_state()`` and
         ``set_state(state)`` choose themselves
     :param info: further values, in JSON, for :func:`checkpoint_info`
-    :param rollout_started: whether it is called in a callback's ``_on_rollout_start``
+    :param rollout_started: None between two calls of ``learn``, each of which begins by resetting the action noise;
+        for a training that goes on as if ``learn`` had not ended, whether it is called in a callback's
+        ``_on_rollout_start``
+    :raises TypeError: if the algorithm is on-policy
     :raises OSError: if the file cannot be written, as on a full disk; nothing is left of it then
     """
+    _check_off_policy(model)
+    assert model.replay_buffer is not None  # for the type checker
     env = model.get_env()
     if env is None:
         raise ValueError("the model has no environment, and a checkpoint holds the environment's state; use set_env")
@@ -82,9 +83,10 @@ def save_checkpoint(
     state = {
         "algorithm": type(model),
         "environments": environments,
-        "replay_buffer": model.replay_buffer,
+        "replay_buffer": filled_part(model.replay_buffer),
         "noise": noise,
-        "callbacks": [(type(each).__qualname__, _callback_state(each)) for each in _flattened(callbacks)],
+        "within_learn": rollout_started is not None,
+        "callbacks": callbacks_state(callbacks),
         "random": random_states(),  # last: whatever drew before is drawn
     }
     told = {"steps": model.num_timesteps, "algorithm": type(model).__name__, "info": dict(info or {})}
@@ -115,53 +117,60 @@ def load_checkpoint(
     weights by :func:`~sb3_have.export_safetensors`.
 
     :param path: of the file, or of a folder of ``checkpoint-<step>``, of which the newest whole one is taken
-    :param env: made as in the training that wrote it, wrappers and number of environments included; Monitor with
-        ``override_existing=False`` goes on with its file
+    :param env: made as in the training that wrote it, settings, wrappers and number of environments included, since
+        the checkpoint's state overrides them; to train on in another one, give that to ``model.set_env`` afterwards.
+        Monitor with ``override_existing=False`` goes on with its file
     :param callbacks: to put into the state that those of the same classes had, in their order
     :param device: for the model
     :return: the model
     :raises DamagedCheckpointError: if the file is damaged
     :raises FileNotFoundError: if there is none
-    :raises ValueError: if the environment is another, or the folder is of an older form
+    :raises ValueError: if the environment is another or has other settings, or the folder is of an older form
     """
     file = _file_of(Path(path))
     _, saved, state = read_archive(file)
+    buffer = at_full_size(state.pop("replay_buffer"))
     with warnings.catch_warnings():
-        # SB3 would warn that n-step returns have to be set up: they are, in the replay buffer of the checkpoint
+        # SB3 would warn that n-step returns have to be set up: they are, in the replay buffer of the checkpoint, which
+        # is given so that SB3 does not make another one
         warnings.filterwarnings("ignore", message="`n_steps=")
-        model = state["algorithm"].load(saved, env=env, device=device, force_reset=False)
+        model = state["algorithm"].load(saved, env=env, device=device, force_reset=False, replay_buffer=buffer)
     model.observation_space, model.action_space = restore_environments(model.env, state["environments"])
-    model.replay_buffer = _fitted(state["replay_buffer"], model)
+    buffer.device = model.device
+    if hasattr(buffer, "set_env"):  # HerReplayBuffer
+        buffer.set_env(model.env)
     if state["environments"].lost:
         model._last_obs = None  # so that `learn` resets the environments
-        if hasattr(model.replay_buffer, "truncate_last_trajectory"):
-            model.replay_buffer.truncate_last_trajectory()
+        end_last_episode(buffer)
     if state["noise"]:
         vars(model.actor.action_dist).update({name: noise.to(model.device) for name, noise in state["noise"].items()})
         _skip_once(model.actor, "reset_noise")
     # where the episodes begin anew, so does the noise
-    if model.action_noise is not None and model._last_obs is not None:
+    if state["within_learn"] and model.action_noise is not None and model._last_obs is not None:
         _skip_once(model.action_noise, "reset")  # by which `learn` begins
-    _restore_callbacks(callbacks, state["callbacks"])
+    restore_callbacks(callbacks, state["callbacks"])
     set_random_states(state["random"])
     return model
 
 
-def _fitted(replay_buffer: ReplayBuffer, model: OffPolicyAlgorithm) -> ReplayBuffer:
-    """A loaded replay buffer for this device and, as HerReplayBuffer needs it, this environment."""
-    replay_buffer.device = model.device
-    if hasattr(replay_buffer, "set_env"):
-        replay_buffer.set_env(model.env)
-    return replay_buffer
+def _check_off_policy(model: BaseAlgorithm) -> None:
+    """
+    :raises TypeError: if an algorithm is on-policy
+    """
+    if not isinstance(model, OffPolicyAlgorithm):
+        raise TypeError(
+            f"{type(model).__name__} is on-policy, and checkpoints are of off-policy algorithms; use SB3's "
+            "CheckpointCallback"
+        )
 
 
 def _skip_once(owner: Any, method: str) -> None:
     """Let the next call of a method do nothing: what it would draw or reset has been, before the checkpoint."""
 
-    def skip(*args: Any, **kwargs: Any) -> None:
-        delattr(owner, method)
+    def skip(self: Any, *args: Any, **kwargs: Any) -> None:
+        delattr(self, method)
 
-    setattr(owner, method, skip)
+    setattr(owner, method, MethodType(skip, owner))  # which goes along when the owner is copied
 
 
 def checkpoint_info(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -193,6 +202,14 @@ def newest_checkpoint(folder: str | os.PathLike[str]) -> Path | None:
         else:
             return path
     return None
+
+
+def _is_whole(path: Path) -> bool:
+    try:
+        check_archive(path)
+    except DamagedCheckpointError:
+        return False
+    return True
 
 
 def _file_of(path: Path) -> Path:
@@ -244,9 +261,10 @@ class ResumableCheckpointCallback(BaseCallback):
 
     First in a list of callbacks, it lets no ``_on_rollout_start`` be run twice where the training goes on. The state of
     all callbacks of the training is saved. A checkpoint that cannot be written is told by a warning. Within another
-    callback (``EveryNTimesteps``) it would not be told of rollouts, and is refused.
+    callback (``EveryNTimesteps``) it would not be told of rollouts, and is refused; so are on-policy algorithms.
 
-    :param folder: for ``checkpoint-<step>``
+    :param folder: for ``checkpoint-<step>`` of this training alone: one that has later checkpoints than the training
+        has steps is refused, and so is one in which another process trains
     :param save_freq: steps from one to the next, in all environments together as ``num_timesteps``; there is a further
         one at the end
     :param keep: how many of the newest stay
@@ -266,10 +284,20 @@ class ResumableCheckpointCallback(BaseCallback):
                 f"ResumableCheckpointCallback within {type(self.parent).__name__} never saves; give it to `learn`, "
                 "alone or in a list, and how often it should save by `save_freq`"
             )
+        _check_off_policy(self.model)
 
     def _on_training_start(self) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
         self._last_step = self.model.num_timesteps
+        later = [path for path in checkpoints(self.folder) if checkpoint_step(path) > self._last_step]
+        if any(map(_is_whole, later)):
+            raise ValueError(
+                f"{later[-1]} is later than this training, which has {self._last_step} steps, and load_checkpoint "
+                "would take it: choose another folder, or remove it; to go on from it, use load_checkpoint and "
+                "`learn(..., reset_num_timesteps=False)`"
+            )
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._lock = ExitStack()  # which a training that fails gives back with the callback
+        self._lock.enter_context(locked(self.folder))
 
     def _on_rollout_start(self) -> None:
         # The only call of a callback with nothing pending: in `_on_step` the transition is still to be stored, and in
@@ -285,6 +313,7 @@ class ResumableCheckpointCallback(BaseCallback):
         # where a callback ended the training, its last transition is in no replay buffer
         if self.locals.get("new_obs") is self.model._last_obs:
             self._save(rollout_started=False)
+        self._lock.close()
 
     def _save(self, rollout_started: bool) -> None:
         assert isinstance(self.model, OffPolicyAlgorithm)
@@ -295,9 +324,14 @@ class ResumableCheckpointCallback(BaseCallback):
             print(f"Saved checkpoint-{self.model.num_timesteps} in {self.folder}")
 
 
+def _cuda_is_in_use() -> bool:
+    """To ask for its random numbers would start it."""
+    return bool(th.cuda.is_initialized())  # type: ignore[no-untyped-call, unused-ignore]
+
+
 def random_states() -> dict[str, Any]:
-    """States of the global random generators of Python, NumPy and PyTorch, CUDA's included."""
-    cuda = th.cuda.get_rng_state_all() if th.cuda.is_available() else []
+    """States of the global random generators of Python, NumPy and PyTorch, CUDA's included where it is in use."""
+    cuda = th.cuda.get_rng_state_all() if _cuda_is_in_use() else []
     return {"python": random.getstate(), "numpy": np.random.get_state(), "torch": th.get_rng_state(), "cuda": cuda}
 
 
@@ -306,7 +340,7 @@ def set_random_states(states: Mapping[str, Any]) -> None:
     random.setstate(states["python"])
     np.random.set_state(states["numpy"])
     th.set_rng_state(states["torch"])
-    if th.cuda.is_available() and len(states["cuda"]) == th.cuda.device_count():
+    if _cuda_is_in_use() and len(states["cuda"]) == th.cuda.device_count():
         th.cuda.set_rng_state_all(states["cuda"])
 
 
@@ -318,54 +352,3 @@ def same_random_numbers() -> Iterator[None]:
         yield
     finally:
         set_random_states(states)
-
-
-def _flattened(callbacks: Callbacks) -> list[BaseCallback]:
-    """Callbacks and those within them, but for mere lists and the progress bar."""
-    waiting = [callbacks] if isinstance(callbacks, BaseCallback) else list(callbacks or ())
-    found: list[BaseCallback] = []
-    while waiting:
-        callback = waiting.pop(0)
-        if any(callback is each for each in found):
-            continue
-        found.append(callback)
-        for name, value in vars(callback).items():
-            children = value if isinstance(value, list | tuple) else [value]
-            if name != "parent":
-                waiting += [child for child in children if isinstance(child, BaseCallback)]
-    return [each for each in found if not isinstance(each, CallbackList | ProgressBarCallback)]
-
-
-def _has_own_state(callback: BaseCallback) -> bool:
-    return hasattr(callback, "get_state") and hasattr(callback, "set_state")
-
-
-def _callback_state(callback: BaseCallback) -> Any:
-    if _has_own_state(callback):
-        return callback.get_state()  # type: ignore[attr-defined]
-    # what the constructor takes is the user's, who may give something else when the training goes on
-    constructors = [vars(each)["__init__"] for each in type(callback).__mro__ if "__init__" in vars(each)]
-    given = {name for each in constructors for name in inspect.signature(each).parameters} | {"locals", "globals"}
-    return {name: value for name, value in vars(callback).items() if name not in given and _is_plain(value)}
-
-
-def _is_plain(value: Any) -> bool:
-    if isinstance(value, Mapping):
-        return all(_is_plain(each) for pair in value.items() for each in pair)
-    if isinstance(value, CONTAINERS):
-        return all(map(_is_plain, value))
-    return isinstance(value, (*PLAIN, *PLAIN_RANDOM))
-
-
-def _restore_callbacks(callbacks: Callbacks, states: list[tuple[str, Any]]) -> None:
-    waiting = list(states)
-    for callback in _flattened(callbacks):
-        name = type(callback).__qualname__
-        index = next((index for index, (saved, _) in enumerate(waiting) if saved == name), None)
-        if index is None:
-            continue  # it was not there then
-        _, state = waiting.pop(index)
-        if _has_own_state(callback):
-            callback.set_state(state)  # type: ignore[attr-defined]
-        else:
-            vars(callback).update(state)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import random
 import re
 from collections.abc import Sequence
@@ -15,11 +16,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv,
 
 from sb3_have.common.archive import dumps, loads
 
-NO_STATE = ("spec", "_cached_spec")
+NO_STATE = ("spec", "_cached_spec", "render_mode")
 """Attributes of an environment that tell how it was made."""
 
-NO_VEC_STATE = ("class_attributes", "remotes", "work_remotes", "processes")
-"""Attributes of a ``VecEnv`` that tell its class, or lead to other processes."""
+NO_VEC_STATE = ("class_attributes", "remotes", "work_remotes", "processes", "render_mode")
+"""Attributes of a ``VecEnv`` that tell its class and how it draws, or lead to other processes."""
 
 DRAWING = ("pygame", "highway_env.envs.common.graphics")
 """Modules whose windows and surfaces an environment makes anew when it draws."""
@@ -33,6 +34,7 @@ class LayersState(NamedTuple):
     names: list[str]
     pickled: bytes
     lost: list[str]  # what cannot be pickled; not empty: the rest is of no use but for what is random in it
+    settings: Sequence[dict[str, str]] = ()  # what they were made with
 
 
 class EnvironmentsState(NamedTuple):
@@ -68,9 +70,9 @@ class ResumableEnv(gym.Wrapper[Any, Any, Any, Any]):
         """State of the environment and of the process's own random numbers."""
         return _capture(_gym_layers(self), (random.getstate(), np.random.get_state()))
 
-    def checkpoint_layers(self) -> list[str]:
-        """Names of the classes that the state is of, outermost first."""
-        return _names(_gym_layers(self))
+    def checkpoint_layers(self) -> list[tuple[str, dict[str, str]]]:
+        """Classes that the state is of, outermost first, and what they were made with."""
+        return _described(_gym_layers(self))
 
     def restore_checkpoint_state(self, state: LayersState) -> None:
         """
@@ -108,10 +110,11 @@ def environments_state(vec_env: VecEnv, shared: Any = None) -> EnvironmentsState
 def restore_environments(vec_env: VecEnv, state: EnvironmentsState) -> Any:
     """Put environments into a state.
 
-    :param vec_env: made like those that the state is of
+    :param vec_env: made like those that the state is of; other settings, of which gymnasium tells what was given to
+        ``gym.make`` and to its own wrappers, would be overridden by the state and are refused
     :param state: of :func:`environments_state`
     :return: what was ``shared``
-    :raises ValueError: if they have other wrappers, or are more or fewer
+    :raises ValueError: if they have other wrappers or settings, or are more or fewer
     """
     layers = _vec_layers(vec_env)
     base = layers[-1]
@@ -126,8 +129,8 @@ def restore_environments(vec_env: VecEnv, state: EnvironmentsState) -> Any:
             raise ValueError(
                 f"the checkpoint has the state of environments in ResumableEnv, and was given {OUT_OF_REACH}"
             )
-        for names, worker in zip(base.env_method("checkpoint_layers"), state.workers, strict=True):
-            _check_names(worker.names, names)
+        for described, worker in zip(base.env_method("checkpoint_layers"), state.workers, strict=True):
+            _check_made_alike(worker, described)
     for index, worker in enumerate(state.workers):
         if isinstance(worker, LayersState):
             base.env_method("restore_checkpoint_state", worker, indices=index)
@@ -159,10 +162,11 @@ def _gym_layers(env: gym.Env[Any, Any]) -> list[Any]:
 
 
 def _capture(layers: Sequence[Any], shared: Any) -> LayersState:
-    names, states = _names(layers), [_attributes(layer) for layer in layers]
+    names, settings = zip(*_described(layers), strict=True)
+    states = [_attributes(layer) for layer in layers]
     known = [set(vars(layer)) for layer in layers]
     try:
-        return LayersState(names, dumps((states, known, shared), layers), [])
+        return LayersState([*names], dumps((states, known, shared), layers), [], settings)
     except Exception:  # whatever the environment's objects raise when they are asked for their state
         lost = [
             {name: reason for name, value in state.items() if (reason := _failure(value, layers))} for state in states
@@ -181,7 +185,7 @@ def _capture(layers: Sequence[Any], shared: Any) -> LayersState:
         for owner, failures in zip(names, lost, strict=True)
         for name, reason in failures.items()
     ]
-    return LayersState(names, dumps((rest, known, shared), layers), told)
+    return LayersState([*names], dumps((rest, known, shared), layers), told, settings)
 
 
 def _attributes(layer: Any) -> dict[str, Any]:
@@ -201,25 +205,52 @@ def _failure(value: Any, layers: Sequence[Any]) -> str:
     try:
         dumps(value, layers)
     except Exception as error:
-        # without addresses, which would make every warning another one
-        return re.sub(r" at 0x[0-9a-f]+", "", f"{type(error).__name__}: {error}")
+        return _without_addresses(f"{type(error).__name__}: {error}")  # they make every warning another one
     return ""
 
 
-def _names(layers: Sequence[Any]) -> list[str]:
-    return [type(layer).__qualname__ for layer in layers]
+def _without_addresses(text: str) -> str:
+    return re.sub(r" at 0x[0-9a-fA-F]+", "", text)
 
 
-def _check_names(expected: list[str], names: list[str]) -> None:
-    if names != expected:
+def _described(layers: Sequence[Any]) -> list[tuple[str, dict[str, str]]]:
+    return [(type(layer).__qualname__, _settings(layer)) for layer in layers]
+
+
+def _settings(layer: Any) -> dict[str, str]:
+    """What an environment or wrapper was made with, as far as gymnasium keeps it, but for how it draws."""
+    settings: dict[str, Any] = vars(layer).get("_saved_kwargs", {})  # of gymnasium's own wrappers
+    if not isinstance(layer, VecEnv | gym.Wrapper) and layer.spec is not None:
+        parameters = inspect.signature(type(layer).__init__).parameters
+        defaults = {name: each.default for name, each in parameters.items() if each.default is not each.empty}
+        settings = defaults | layer.spec.kwargs
+    return {name: _without_addresses(repr(value)) for name, value in settings.items() if name != "render_mode"}
+
+
+def _check_made_alike(state: LayersState, described: list[tuple[str, dict[str, str]]]) -> None:
+    """
+    :raises ValueError: if layers are not those of a state, or were made with other settings
+    """
+    names = [name for name, _ in described]
+    if names != state.names:
         raise ValueError(
-            f"the checkpoint is of environments with other wrappers: {' > '.join(expected)}, and it was given "
+            f"the checkpoint is of environments with other wrappers: {' > '.join(state.names)}, and it was given "
             f"{' > '.join(names)}; make them as in the training that wrote it"
         )
+    if state.lost:
+        return  # their settings stay as they are
+    for (name, given), saved in zip(described, state.settings, strict=False):
+        for key in sorted(given.keys() | saved.keys()):
+            if (now := given.get(key, "not given")) != (then := saved.get(key, "not given")):
+                raise ValueError(
+                    f"the checkpoint's {name} was made with {key}: {then}, and it was given one with {key}: {now}, "
+                    "which its state would override; make it as in the training that wrote it, and to train on in "
+                    "another environment, give that to the loaded model by `set_env`"
+                )
 
 
 def _restore(layers: Sequence[Any], state: LayersState) -> Any:
-    _check_names(state.names, _names(layers))
+    _check_made_alike(state, _described(layers))
     states, known, shared = loads(state.pickled, layers)
     for layer, attributes, names in zip(layers, states, known, strict=True):
         if not state.lost:  # what is computed once and kept (functools.cached_property) may be of the old state

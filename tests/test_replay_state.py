@@ -1,0 +1,156 @@
+"""Replay buffers in checkpoints: no larger than what is in them, and cut where the episodes begin anew."""
+
+import threading
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from resuming import Drifting, assert_same, leaves
+from stable_baselines3 import SAC, HerReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.envs import BitFlippingEnv, SimpleMultiObsEnv
+
+from sb3_have import ModalityReplayBuffer
+from sb3_have.common.checkpoint import load_checkpoint, save_checkpoint
+from sb3_have.common.replay_state import at_full_size, end_last_episode, filled_part
+
+KINDS: dict[str, tuple[type[ReplayBuffer], dict[str, Any]]] = {
+    "n steps": (NStepReplayBuffer, {"n_steps": 3, "gamma": 1.0}),
+    "n steps, timeouts as terminations": (
+        NStepReplayBuffer,
+        {"n_steps": 3, "gamma": 1.0, "handle_timeout_termination": False},
+    ),
+    "overlapping observations": (ReplayBuffer, {"optimize_memory_usage": True, "handle_timeout_termination": False}),
+    "stock": (ReplayBuffer, {}),
+    "frames once": (ModalityReplayBuffer, {"n_steps": 3, "gamma": 1.0}),
+}
+SIZE, N_ENVS = 7, 2
+
+
+def make_buffer(kind: str) -> Any:
+    cls, kwargs = KINDS[kind]
+    env = Drifting()
+    return cls(SIZE * N_ENVS, env.observation_space, env.action_space, "cpu", n_envs=N_ENVS, **kwargs)
+
+
+def add(buffer: Any, obs: int, reward: float = 1.0, done: Any = (0, 0)) -> None:
+    """A transition of every environment from ``obs`` to the next number."""
+    stacks = [np.full((N_ENVS, 2), number, np.float32) for number in (obs, obs + 1)]
+    buffer.add(*stacks, np.zeros((N_ENVS, 2)), np.full(N_ENVS, reward), np.array(done), [{}] * N_ENVS)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("n_before", [1, 4, SIZE, SIZE + 3])
+def test_nothing_runs_across_the_cut(kind: str, n_before: int) -> None:
+    """The second environment has just ended its episode, which stays a termination."""
+    buffer = make_buffer(kind)
+    for step in range(n_before):
+        add(buffer, step, done=(0, step == n_before - 1))
+    end_last_episode(buffer)
+    for step in range(3):
+        add(buffer, 1000 + step, reward=1000.0)
+    np.random.seed(0)
+    samples = buffer.sample(500)
+    before, goes_on = samples.observations[:, 0] < 1000, samples.dones[:, 0] == 0
+    assert before.any() and goes_on.any()
+    assert not (before & goes_on & (samples.next_observations[:, 0] >= 1000)).any(), "another episode's observation"
+    assert (samples.rewards[before, 0] < 1000).all()
+    if buffer.handle_timeout_termination:
+        last = before & (samples.next_observations[:, 0] == n_before)
+        assert 0.3 < samples.dones[last].mean() < 0.7, "of the episode that has ended alone"
+    cut = (n_before - 1) % SIZE
+    for row in range(SIZE):
+        if row != cut:
+            assert not buffer.dones[row].any() and not buffer.timeouts[row].any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_nothing_stored_is_nothing_to_end(kind: str) -> None:
+    buffer = make_buffer(kind)
+    end_last_episode(buffer)
+    assert not buffer.dones.any() and not buffer.timeouts.any()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("n_steps", [0, 2, SIZE - 1, SIZE, SIZE + 2])
+def test_filled_part_is_all_there_is(kind: str, n_steps: int) -> None:
+    buffer = make_buffer(kind)
+    for step in range(n_steps):
+        add(buffer, step)
+    part = filled_part(buffer)
+    rest = at_full_size(part)
+    if kind != "frames once":
+        assert len(part.observations) == min(n_steps + 1, SIZE) and len(buffer.observations) == SIZE
+        assert np.shares_memory(part.observations, buffer.observations)
+    for step in range(n_steps, n_steps + SIZE + 1):
+        for one in (buffer, rest):
+            np.random.seed(step)
+            add(one, step)
+        samples = []
+        for one in (buffer, rest):
+            np.random.seed(step)
+            samples.append(leaves(one.sample(8)))
+        assert_same(*samples)
+
+
+def sac(env: Any, policy: str = "MultiInputPolicy", **kwargs: Any) -> SAC:
+    policy_kwargs = {"net_arch": [4]}
+    return SAC(policy, env, policy_kwargs=policy_kwargs, learning_starts=99, seed=0, device="cpu", **kwargs)
+
+
+@pytest.mark.parametrize("kind", [DictReplayBuffer, HerReplayBuffer])
+def test_file_holds_what_is_filled(kind: type[ReplayBuffer], tmp_path: Path) -> None:
+    def make_env() -> Any:
+        if kind is HerReplayBuffer:
+            return BitFlippingEnv(n_bits=3, continuous=True, max_steps=5)
+        return SimpleMultiObsEnv(discrete_actions=False, random_start=False)
+
+    model = sac(make_env(), buffer_size=3000, replay_buffer_class=kind).learn(20)
+    assert isinstance(model.replay_buffer, DictReplayBuffer)
+    save_checkpoint(model, tmp_path / "mine")
+    n_bytes = sum(array.nbytes for array in model.replay_buffer.observations.values())
+    if kind is DictReplayBuffer:
+        assert (tmp_path / "mine").stat().st_size < n_bytes, "twice that is reserved"
+    loaded = load_checkpoint(tmp_path / "mine", make_env(), device="cpu").replay_buffer
+    for name in ("observations", "next_observations"):
+        assert_same(leaves(getattr(loaded, name)), leaves(getattr(model.replay_buffer, name)))
+        assert all(array.flags.writeable for array in getattr(loaded, name).values())
+
+
+def test_no_second_buffer_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SB3 would, and warn where there is no memory for both."""
+    save_checkpoint(sac(Drifting(), "MlpPolicy", buffer_size=50).learn(9), tmp_path / "mine")
+
+    def make(*args: Any, **kwargs: Any) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(ReplayBuffer, "__init__", make)
+    assert load_checkpoint(tmp_path / "mine", Drifting(), device="cpu").replay_buffer.pos == 9
+
+
+class Connected(Drifting):
+    """Holds what cannot be pickled."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.connection = threading.Lock()
+
+
+def test_episodes_that_begin_anew_are_cut(tmp_path: Path) -> None:
+    model = sac(Connected(), "MlpPolicy", buffer_size=50, n_steps=3).learn(5)
+    with pytest.warns(UserWarning, match=r"Connected\.connection"):
+        save_checkpoint(model, tmp_path / "mine")
+    resumed = load_checkpoint(tmp_path / "mine", Connected(), device="cpu").learn(2, reset_num_timesteps=False)
+    assert resumed.replay_buffer.timeouts[:7, 0].tolist() == [0, 0, 0, 0, 1, 0, 0]
+
+
+def test_goals_are_cut_without_advice() -> None:
+    """SB3's warning tells how not to cut."""
+    env = BitFlippingEnv(n_bits=3, continuous=True, max_steps=5)
+    model = sac(env, buffer_size=50, replay_buffer_class=HerReplayBuffer).learn(3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        end_last_episode(model.replay_buffer)  # type: ignore[arg-type]
+    assert model.replay_buffer.dones[2] and model.replay_buffer.timeouts[2]  # type: ignore[union-attr]
