@@ -39,6 +39,9 @@ def test_unknown_configuration_is_explained(tmp_path: Path) -> None:
         load_config("havesac", "Pendulum-v1")
     (tmp_path / "mine.yml").write_text("A-v0: {gamma: 0.5}")
     assert load_config(str(tmp_path / "mine.yml"), "A-v0") == {"gamma": 0.5}
+    (tmp_path / "mine.yml").write_text("A-v0: 3")
+    with pytest.raises(ValueError, match=r"mine\.yml: expected ids of environments"):
+        load_config(str(tmp_path / "mine.yml"), "A-v0")
 
 
 def test_one_block_for_both_simulators() -> None:

@@ -83,6 +83,17 @@ def test_weights_are_not_exported_twice(zipped: Path) -> None:
     assert "only Box spaces and Dicts of them are exported" in run(zipped, "--format", "safetensors")
 
 
+@pytest.mark.parametrize("name", ["model_vecnormalize_200_steps.pkl", "ReliabilityDrive-v0/vecnormalize.pkl"])
+def test_statistics_beside_the_zip_are_told(zipped: Path, name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """As SB3's CheckpointCallback and as the Zoo save them."""
+    main([str(zipped), "--format", "safetensors"])
+    assert not capsys.readouterr().err
+    (zipped.parent / name).parent.mkdir(exist_ok=True)
+    (zipped.parent / name).touch()
+    main([str(zipped), "--format", "safetensors"])
+    assert f"{zipped.parent / name} suggests that it was trained under VecNormalize" in capsys.readouterr().err
+
+
 def test_help_warns_of_pickle(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["export", "--help"])
     with pytest.raises(SystemExit):

@@ -46,6 +46,7 @@ def nested(depth: int) -> Any:
 
 
 BIAS = "actor.mu.bias"
+HUGE = {"type": "Box", "shape": [4 * 10**7], "dtype": "float32", "low": 0, "high": 1}
 DAMAGES: dict[str, tuple[Damage, str]] = {
     "missing tensor": (drop(BIAS), r"lacks 'actor\.mu\.bias'; .*export it again"),
     "extra tensor": (put("actor.more", th.zeros(1)), r"also has 'actor\.more'"),
@@ -66,6 +67,20 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
     ),
     "action shape": (set_in("action_space", "shape", value=[2, 3, "x"]), r"action_space is damaged"),
     "huge action": (set_in("action_space", "shape", value=[10**5, 10**6]), r"action_space is damaged: .*more than"),
+    "huge keys": (
+        set_in("observation_space", "spaces", value=[[key, dict(HUGE)] for key in "abc"]),
+        r"observation_space is damaged: its spaces have more than",
+    ),
+    **{
+        f"huge {name}": (set_in("policy_kwargs", name, value=value), "its parameters are more than twice those of")
+        for name, value in {
+            "net_arch": {"pi": [10**6, 10**6], "qf": [8]},  # 4 TB, which are not even asked for
+            "features_dim": 10**6,
+            "attention_dim": 10**6,
+            "n_critics": 10**4,
+            "encoder_kwargs": {"a": {"net_arch": [10**6, 10**6]}},
+        }.items()
+    },
     "nesting": (set_in("policy_kwargs", "net_arch", value=nested(450)), r"nested too deep|cannot be built"),
     "action bounds": (set_in("action_space", "low", value=[1, 2, 3]), r"action_space is damaged"),
     "action dtype": (set_in("action_space", "dtype", value="object"), r"action_space is damaged: .*'object'"),

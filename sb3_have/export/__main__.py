@@ -19,6 +19,7 @@ from pathlib import Path
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_have.export.config import NORMALIZED
 from sb3_have.export.onnx import export_onnx
 from sb3_have.export.safetensors import CONFIG_FILE, export_safetensors, load_policy, read_config
 from sb3_have.train import algorithms
@@ -54,6 +55,8 @@ def main(arguments: list[str] | None = None) -> None:
             model, frame_stack = load_policy(source, device="cpu"), read_config(source).get("n_stack")
         else:
             model = load_zip(source, args.algo)
+            for file in statistics_beside(source):
+                print(f"{file} suggests that it was trained under VecNormalize: {NORMALIZED}.", file=sys.stderr)
         if args.format == "onnx":
             export_onnx(model, out, frame_stack)
         else:
@@ -93,6 +96,11 @@ def load_zip(path: Path, algo: str | None = None) -> BaseAlgorithm:
         return algorithms()[algo or found or "havesac"].load(path, device="cpu", buffer_size=1)
     except Exception as error:  # whatever pickle makes of a damaged file
         raise ValueError(f"{path} cannot be loaded: {type(error).__name__}: {error}") from error
+
+
+def statistics_beside(path: Path) -> list[Path]:
+    """Files of VecNormalize's statistics that were saved with a zip: by SB3 beside it, by the Zoo in a folder there."""
+    return sorted(file for where in ("", "*/") for file in path.parent.glob(f"{where}*vecnormalize*.pkl"))
 
 
 if __name__ == "__main__":

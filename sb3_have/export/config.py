@@ -10,7 +10,8 @@ import math
 import platform
 import warnings
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.sac import policies as sac
 from torch import nn
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from sb3_have.common import crossq, encoders, fusion
 from sb3_have.common.buffers import stacked_frames
@@ -69,7 +71,8 @@ NAMES = {kind: name for name, kind in CLASSES.items()}
 NON_FINITE = {"inf": math.inf, "-inf": -math.inf, "nan": math.nan}
 DTYPES = ("float16", "float32", "float64", "uint8", "uint16", "uint32", "int8", "int16", "int32", "int64")
 MAX_SIZE = 10**8
-"""Values of a space, so that a file does not take all memory by a shape; an image of 4K has 2.5e7."""
+"""Values of a space, so that a file does not take all memory by its shapes; an image of 4K has 2.5e7."""
+NORMALIZED = "what is exported takes normalized observations, and the statistics are not in it"
 _ABSENT = object()
 
 
@@ -128,8 +131,8 @@ def warn_of_normalization(model: BaseAlgorithm | BasePolicy) -> None:
     vec_normalize = model.get_vec_normalize_env() if isinstance(model, BaseAlgorithm) else None
     if vec_normalize is not None and vec_normalize.norm_obs:
         warnings.warn(
-            "The model was trained under VecNormalize: what is exported takes normalized observations, and the "
-            "statistics are not in it; save them with `model.get_vec_normalize_env().save(path)`.",
+            f"the model was trained under VecNormalize: {NORMALIZED}; save them with "
+            "`model.get_vec_normalize_env().save(path)`.",
             stacklevel=3,
         )
 
@@ -148,6 +151,7 @@ def versions() -> dict[str, str]:
 def build(
     config: Mapping[str, Any],
     path: Path,
+    size: int,
     policy_class: type[BasePolicy] | None = None,
     policy_kwargs: Mapping[str, Any] | None = None,
 ) -> BasePolicy:
@@ -156,6 +160,7 @@ def build(
 
     :param config: as :func:`describe` gives it
     :param path: its file, for the messages
+    :param size: numbers and tensors of its weights, of which its parameters may have twice as many
     :param policy_class: in place of the configuration's
     :param policy_kwargs: likewise, merged into the configuration's key by key
     :raises ValueError: if the configuration is damaged, of a newer format, or lacks classes; names file and remedy
@@ -175,13 +180,32 @@ def build(
     except RecursionError as error:
         raise ValueError(f"{path}: nested too deep; export the policy again.") from error
     try:
-        policy: BasePolicy = kind(observation_space, action_space, _no_schedule, **kwargs)  # type: ignore[arg-type]
+        with _at_most(2 * size):  # twice, as a constructor may replace what it made
+            policy: BasePolicy = kind(observation_space, action_space, _no_schedule, **kwargs)  # type: ignore[arg-type]
     except Exception as error:  # whatever a damaged file makes of the arguments
         raise ValueError(
             f"{path}: {kind.__name__} cannot be built of it: {type(error).__name__}: {error} Export it again, or mend "
             "it by `policy_class` and `policy_kwargs`."
         ) from error
     return policy
+
+
+@contextmanager
+def _at_most(size: int) -> Iterator[None]:
+    """ValueError in here as soon as parameters have more numbers, so that a file takes no memory by its arguments."""
+    left = size
+
+    def count(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
+        nonlocal left
+        left -= 0 if parameter is None else parameter.numel() + 1
+        if left < 0:
+            raise ValueError("its parameters are more than twice those of the weights.")
+
+    hook = register_module_parameter_registration_hook(count)
+    try:
+        yield
+    finally:
+        hook.remove()
 
 
 def _no_schedule(progress_remaining: float) -> float:
@@ -293,6 +317,8 @@ def space_from_json(value: Any, path: Path, where: str) -> spaces.Space[Any]:
     """
     try:
         if value["type"] == "Dict":
+            if sum(math.prod(item["shape"]) for _, item in value["spaces"]) > MAX_SIZE:
+                raise ValueError(f"its spaces have more than {MAX_SIZE} values")
             pairs = [(str(key), space_from_json(item, path, f"{where}[{key!r}]")) for key, item in value["spaces"]]
             return spaces.Dict(OrderedDict(pairs))
         if value["type"] != "Box" or value["dtype"] not in DTYPES:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -114,7 +115,8 @@ def load_policy(
                 "arguments by `policy_kwargs` rather than in the file."
             )
         with th.random.fork_rng(devices=[]):  # initial weights are drawn, and drawn for nothing
-            policy = build(config, folder / CONFIG_FILE, policy_class, policy_kwargs)
+            size = sum(math.prod(opened.get_slice(name).get_shape()) + 1 for name in opened.keys())  # noqa: SIM118
+            policy = build(config, folder / CONFIG_FILE, size, policy_class, policy_kwargs)
         expected = policy.state_dict()
         _check_names(file, expected.keys() - set(opened.keys()), set(opened.keys()) - expected.keys())
         tensors = {}
