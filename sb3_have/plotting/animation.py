@@ -74,6 +74,8 @@ class Frames:
             width = round(self.tile * picture.shape[1] / picture.shape[0])
             method = Image.Resampling.NEAREST if self.tile > picture.shape[0] else Image.Resampling.BOX
             frame.paste(Image.fromarray(picture).resize((width, self.tile), method), (x, self._sensors + LINE))
+            outline = (x, self._sensors + LINE, x + width - 1, self._sensors + LINE + self.tile - 1)
+            draw.rectangle(outline, outline="#bbbbbb")  # an event camera that sees nothing is white
             draw.text((max(x, GAP), self._sensors), name, fill="#555555", font=self.font)
             x += width + GAP
         for row, (name, look) in enumerate(self.styles.items()):
@@ -98,8 +100,8 @@ class Frames:
         facts += [f"step {step}" if recording.seconds is None else f"{recording.times[step]:.1f} s"]
         facts += [f"{info['speed']:.0f} m/s"] if "speed" in info else []
         facts += [f"{info['distance']:.0f} m"] if "distance" in info else []
-        facts += [f"return {self.returns[step]:.1f}"] if len(self.returns) else []
-        facts += [f"Q {self.q[step]:.1f}"] if self.q is not None else []
+        facts += [f"return {_rounded(self.returns[step])}"] if len(self.returns) else []
+        facts += [f"Q {_rounded(self.q[step])}"] if self.q is not None else []
         lines = facts[:1]
         for fact in facts[1:]:
             longer = f"{lines[-1]} | {fact}"
@@ -142,6 +144,11 @@ class Frames:
         draw.line((self.left + now, top, self.left + now, top + CHART - 1), fill="#777777")
         draw.text((GAP, top - 2), "100 %", fill="#555555", font=self.font)
         draw.text((GAP, top + CHART - LINE + 3), "0", fill="#555555", font=self.font)
+
+
+def _rounded(number: float) -> str:
+    """To one digit, and never "-0.0"."""
+    return f"{round(float(number), 1) + 0.0:.1f}"
 
 
 def write_animation(
