@@ -4,8 +4,9 @@
 
 MODEL is a zip that SB3 saved, a checkpoint, or the folder of a run of ``python -m sb3_have.train``, whose settings then
 tell the environment. Without them it is HighwayVision-v0 as in ``--config``, with the modalities and the image size
-that the model reads; ``--env`` and ``--env-kwargs`` name another one. The ending of ``--out`` decides between mp4 and
-GIF.
+that the model reads; ``--env`` and ``--env-kwargs`` name another one. Statistics of ``VecNormalize`` are those of the
+checkpoint, else of ``vecnormalize.pkl`` beside the model or where the Zoo puts it; a model's zip does not tell whether
+it needs them. The ending of ``--out`` decides between mp4 and GIF.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_have.common.archive import DamagedCheckpointError
 from sb3_have.common.checkpoint import checkpoint_info, checkpoints
 from sb3_have.common.recording import Recording, record_episode
+from sb3_have.common.wrapping import saved_normalizer
 from sb3_have.configuration import env_wrapper, hyperparameter, load_config
 from sb3_have.envs.vision import MODALITIES
 from sb3_have.plotting import write_animation
@@ -71,7 +73,7 @@ def read_model(file: Path) -> tuple[io.BytesIO, dict[str, Any]]:
 
     :param file: a model or a checkpoint
     :return: the model's zip; ``config``, ``env_id`` ... of the run of :mod:`sb3_have.train` that it is of, told by the
-        checkpoint or by one beside the model, else empty
+        checkpoint or by one beside its ``model.zip``, else empty
     :raises ValueError: if it is neither, or damaged
     """
     try:
@@ -81,7 +83,8 @@ def read_model(file: Path) -> tuple[io.BytesIO, dict[str, Any]]:
                 return io.BytesIO(archive.read("model.zip")), dict(told.get("info", {}).get("settings", {}))
     except (zipfile.BadZipFile, KeyError, ValueError) as error:
         raise ValueError(f"{file} is not a model that SB3's save() wrote, or it is damaged: {error}") from error
-    for checkpoint in reversed(checkpoints(file.parent)):
+    # a model of another name may be of anywhere
+    for checkpoint in reversed(checkpoints(file.parent) if file.name == "model.zip" else []):
         with suppress(DamagedCheckpointError):
             return io.BytesIO(file.read_bytes()), dict(checkpoint_info(checkpoint)["info"].get("settings", {}))
     return io.BytesIO(file.read_bytes()), {}
@@ -160,6 +163,19 @@ def environment(
     return env_id, {**defaults.get("env_kwargs", {}), **fitting_env_kwargs(model.observation_space)}, defaults
 
 
+def statistics_file(file: Path, env_id: str) -> Path | None:
+    """Where the statistics of the ``VecNormalize`` of a model's training may be, None if nowhere.
+
+    :param file: a model or a checkpoint
+    :param env_id: of its environment, by which the Zoo calls the folder
+    """
+    with zipfile.ZipFile(file) as archive:
+        if "state.pkl" in archive.namelist():
+            return file
+    candidates = [folder / "vecnormalize.pkl" for folder in (file.parent, file.parent / env_id)]
+    return next(filter(Path.is_file, candidates), None)
+
+
 def main(arguments: list[str] | None = None) -> None:
     """Command line of ``python -m sb3_have.watch``."""
     parser = argparse.ArgumentParser(prog="python -m sb3_have.watch", description=(__doc__ or "").splitlines()[0])
@@ -184,6 +200,9 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--algo", choices=list(algorithms()), help="default: the one that saved the model")
     parser.add_argument(
         "--config", default="have", help="whose environment is used without a run's settings; default: %(default)s"
+    )
+    parser.add_argument(
+        "--vecnormalize", type=Path, metavar="FILE", help="of VecNormalize.save(); default: vecnormalize.pkl, if any"
     )
     parser.add_argument("--stochastic", action="store_true", help="sample the actions rather than take their mode")
     parser.add_argument("--device", default="auto")
@@ -213,7 +232,10 @@ def watch(args: argparse.Namespace) -> Recording:
     model, settings = load_model(file, args.algo, args.device)
     env_id, env_kwargs, config = environment(model, settings, args.env, args.config)
     env_kwargs |= dict(args.env_kwargs) | ({} if args.weather is None else {"weather": args.weather})
-    print(f"{env_id} {env_kwargs}")
+    statistics = args.vecnormalize or statistics_file(file, env_id)
+    normalizer = None if statistics is None else saved_normalizer(statistics)
+    told = "" if normalizer is None else f", observations normalised as in {statistics}"
+    print(f"{env_id} {env_kwargs}{told}")
     recording = record_episode(
         model,
         env_id,
@@ -224,6 +246,7 @@ def watch(args: argparse.Namespace) -> Recording:
         deterministic=not args.stochastic,
         render=env_id not in CAMERAS,  # there the picture is that of the sensors
         progress_bar=True,
+        normalizer=normalizer,
     )
     write_animation(recording, args.out, args.fps, args.width, progress_bar=True)
     return recording

@@ -1,6 +1,8 @@
 """Recordings: what was seen, done, got and thought at each step belongs together, in any environment."""
 
+import pickle
 from copy import deepcopy
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -8,14 +10,16 @@ import numpy as np
 import pytest
 import torch as th
 from envs import RandomSensors, sensors_space, tiny_model, vector, vectors_space
-from fake_drive import ENV_ID
+from fake_drive import ENV_ID, FakeDrive
 from gymnasium import spaces
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from sb3_have import HAVESAC
+from sb3_have.common.checkpoint import save_checkpoint
 from sb3_have.common.drivers import RandomDriver
 from sb3_have.common.recording import Recording, record_episode
+from sb3_have.common.wrapping import saved_normalizer
 
 
 def of_step(recording: Recording, step: int) -> dict[str, np.ndarray]:
@@ -69,13 +73,54 @@ def test_an_environment_that_was_made_is_left_at_the_end_of_its_episode() -> Non
 
 
 def test_an_id_without_weather_is_rendered_where_it_can_be() -> None:
-    recording = record_episode(RandomDriver(), ENV_ID, env_kwargs={"image_size": 40}, seed=1)
+    recording = record_episode(RandomDriver(), ENV_ID, env_kwargs={"image_size": 40}, seed=1, render=True)
     assert len(recording.rewards) == len(recording.pictures) == 5
     assert recording.pictures[0].shape == (40, 80, 3) and recording.seconds == 0.2
     assert recording.rewards == pytest.approx(1 + recording.actions[:, 0])  # slow: 1 m and the throttle
     assert not recording.values and not recording.weights
-    assert not record_episode(RandomDriver(), ENV_ID, render=False).pictures
+    assert not record_episode(RandomDriver(), ENV_ID).pictures
     assert len(record_episode(RandomDriver(), ENV_ID, "fast", max_steps=2).rewards) == 2
+
+
+def test_an_environment_is_closed_whatever_its_wrapper_does(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed: list[str] = []
+    monkeypatch.setattr(FakeDrive, "close", lambda self: closed.append("environment"))
+
+    class Wrapper(gym.Wrapper[Any, Any, Any, Any]):
+        def close(self) -> None:
+            closed.append("wrapper")
+            super().close()
+
+    def broken(env: gym.Env[Any, Any]) -> gym.Env[Any, Any]:
+        raise RuntimeError("no such sensor")
+
+    with pytest.raises(RuntimeError, match="no such sensor"):
+        record_episode(RandomDriver(), ENV_ID, env_wrapper=broken)
+    assert closed == ["environment"]
+    record_episode(RandomDriver(), ENV_ID, env_wrapper=Wrapper, max_steps=1)
+    assert closed == ["environment", "wrapper", "environment"]
+
+
+def test_statistics_for_a_model_without_its_environment(tmp_path: Path) -> None:
+    env = VecNormalize(VecFrameStack(DummyVecEnv([lambda: RandomSensors(vectors_space())]), 2), norm_obs_keys=["a"])
+    model = tiny_model(vectors_space(), env=env)
+    model.learn(30)
+    with_env = record_episode(model, RandomSensors(vectors_space()), seed=1)
+    env.save(str(tmp_path / "vecnormalize.pkl"))
+    save_checkpoint(model, tmp_path / "checkpoint-30")
+    model.env = model._vec_normalize_env = None
+    for name in ("vecnormalize.pkl", "checkpoint-30"):
+        normalizer = saved_normalizer(tmp_path / name)
+        again = record_episode(model, RandomSensors(vectors_space()), seed=1, normalizer=normalizer)
+        np.testing.assert_array_equal(again.actions, with_env.actions)
+    without = record_episode(model, RandomSensors(vectors_space()), seed=1)
+    assert np.abs(without.actions - with_env.actions).max() > 1e-3
+    (tmp_path / "other.pkl").write_bytes(pickle.dumps([1]))
+    with pytest.raises(ValueError, match=r"other\.pkl holds a list, not a VecNormalize"):
+        saved_normalizer(tmp_path / "other.pkl")
+    plain = tiny_model(vectors_space())
+    save_checkpoint(plain, tmp_path / "checkpoint-0")
+    assert saved_normalizer(tmp_path / "checkpoint-0") is None
 
 
 def test_a_box_observation_has_values_too() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import gymnasium as gym
 import numpy as np
 import pytest
 import torch as th
@@ -15,13 +16,17 @@ from fake_drive import CONFIG, ENV_ID
 from gymnasium import spaces
 from PIL import Image
 from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from sb3_have import HAVESAC, train, watch
-from sb3_have.common.recording import Recording
+from sb3_have.common.checkpoint import save_checkpoint
+from sb3_have.common.recording import Recording, record_episode
 from sb3_have.plotting import Frames, animation, write_animation
 from sb3_have.plotting.style import modality_colours
 
 T = 6
+VECTORS = "Vectors-v0"
+gym.register(VECTORS, lambda **_: RandomSensors(vectors_space()))
 
 
 def film(path: Path) -> tuple[np.ndarray, float]:
@@ -111,23 +116,39 @@ def test_frames_show_images_weights_and_facts() -> None:
     frames, colour = Frames(a_recording(), 240), modality_colours(["rgb"])["rgb"]
     for step in range(T):
         pixels = np.asarray(frames[step])
-        tile = pixels[frames.tile // 2 + 36, frames.tile // 2]
+        tile = pixels[frames.tile // 2 + frames._sensors + 18, frames.tile // 2]
         np.testing.assert_array_equal(tile, 40 * step)
+        top = frames._sensors + 18
+        assert (pixels[top, : frames.tile] == 0xBB).all() and (pixels[top : top + frames.tile, 0] == 0xBB).all()
         bars = near(pixels, colour, 30)[frames._top : frames._top + 18].sum(axis=1).max()
         assert bars == pytest.approx(frames.recording.weights["rgb"][step] * (frames.right - frames.left), abs=2)
         chart = near(pixels, colour, 30)[frames._top + 36 :]
         last = np.flatnonzero(chart.any(axis=0)).max(initial=frames.left)
         assert last == pytest.approx(frames.left + step / (T - 1) * (frames.right - frames.left), abs=3)
     # the return before the step, and the lower of the twins' values
-    assert frames._facts(3) == "fast | 0.6 s | 9 m/s | 21 m | return 3.0 | Q -1.4"
-
-
-def test_a_picture_of_its_own_stands_beside_foreign_sensors() -> None:
     recording = a_recording()
-    recording.pictures = [np.full((10, 20, 3), 77, np.uint8)] * T
-    assert list(Frames(recording)._tiles(0)) == ["rgb", "depth"]  # render() of these cameras shows the same
+    recording.values["q"][:] = -0.04
+    assert Frames(recording, 400)._facts(0)[0].endswith("return 0.0 | Q 0.0")
+    wide = Frames(a_recording(), 400)
+    assert wide._facts(3) == ["fast | 0.6 s | 9 m/s | 21 m | return 3.0 | Q -1.4"]
+
+
+@pytest.mark.parametrize("width", [120, 200])
+def test_facts_of_a_narrow_frame_take_several_lines(width: int) -> None:
+    narrow, wide = Frames(a_recording(), width), Frames(a_recording(), 640)
+    lines = narrow._facts(3)
+    assert len(lines) > 1 and " | ".join(lines) == wide._facts(3)[0]
+    assert all(narrow.font.getlength(line) < width for line in lines)
+    row = np.asarray(narrow[3])[18 * (len(lines) - 1) : 18 * len(lines)]
+    assert (row.mean(axis=-1) < 100).any(), "the last of them is drawn"
+
+
+def test_a_picture_of_its_own_stands_beside_the_sensors() -> None:
+    recording = a_recording()
     for observation in recording.observations:
         observation["radar"] = np.zeros((8, 8, 1), np.uint8)
+    assert list(Frames(recording)._tiles(0)) == ["rgb", "depth", "radar"]
+    recording.pictures = [np.full((10, 20, 3), 77, np.uint8)] * T
     tiles = Frames(recording)._tiles(0)
     assert list(tiles) == ["", "rgb", "depth", "radar"] and tiles[""].shape == (10, 20, 3)
     with pytest.raises(ValueError, match="empty"):
@@ -221,6 +242,11 @@ def test_a_checkpoint_and_a_model_beside_it_tell_the_same(run: Path, tmp_path: P
     assert same == settings
     for left, right in zip(model.policy.parameters(), from_checkpoint.policy.parameters(), strict=True):
         assert th.equal(left, right)
+    # a model of another name beside it is of anywhere
+    foreign = run / "night_driver.zip"
+    foreign.write_bytes((run / "model.zip").read_bytes())
+    assert watch.load_model(foreign, device="cpu")[1] == {}
+    foreign.unlink()
     running = tmp_path / "running"  # no model.zip yet; the newest checkpoint counts
     running.mkdir()
     (running / "checkpoint-20").write_bytes((run / "checkpoint-20").read_bytes())
@@ -228,3 +254,37 @@ def test_a_checkpoint_and_a_model_beside_it_tell_the_same(run: Path, tmp_path: P
     assert watch.model_file(running) == running / "checkpoint-20"
     with pytest.raises(FileNotFoundError, match=r"model\.zip and .*checkpoint-<step>"):
         watch.model_file(tmp_path)
+
+
+def test_statistics_of_the_training_are_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    env = VecNormalize(VecFrameStack(DummyVecEnv([lambda: gym.make(VECTORS)]), 2))
+    model = tiny_model(vectors_space(), env=env)
+    model.learn(30)
+    expected = record_episode(model, VECTORS, seed=3).actions
+    driven: list[Recording] = []
+
+    def write(recording: Recording, *args: Any, **kwargs: Any) -> None:
+        driven.append(recording)
+
+    monkeypatch.setattr(watch, "write_animation", write)
+
+    def film(file: Path, *more: str) -> str:
+        watch.main([str(file), "--env", VECTORS, "--seed", "3", "--out", str(tmp_path / "a.gif"), *more])
+        return capsys.readouterr().out
+
+    save_checkpoint(model, tmp_path / "checkpoint-30")
+    model.save(tmp_path / "best.zip")
+    env.save(str(tmp_path / "elsewhere.pkl"))
+    assert "normalised as in" in film(tmp_path / "checkpoint-30")
+    assert "normalised" not in film(tmp_path / "best.zip")
+    film(tmp_path / "best.zip", "--vecnormalize", str(tmp_path / "elsewhere.pkl"))
+    folder = tmp_path / VECTORS  # of the Zoo
+    folder.mkdir()
+    (tmp_path / "elsewhere.pkl").rename(folder / "vecnormalize.pkl")
+    film(tmp_path / "best.zip")
+    (folder / "vecnormalize.pkl").rename(tmp_path / "vecnormalize.pkl")
+    assert f"normalised as in {tmp_path / 'vecnormalize.pkl'}" in film(tmp_path / "best.zip")
+    same = [np.array_equal(recording.actions, expected) for recording in driven]
+    assert same == [True, False, True, True, True]

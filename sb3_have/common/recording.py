@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 from gymnasium.envs.registration import load_env_creator
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from tqdm import tqdm
 
 from sb3_have.common.episodes import Predictor
@@ -28,7 +28,7 @@ class Recording:
     :param weather: of the episode; empty if the environment has none
     :param seconds: length of a step [s]; None if the environment does not tell (``metadata["render_fps"]``)
     :param observations: the environment's own, T dicts (or arrays) with images as it gives them, not stacked
-    :param pictures: what ``render()`` gave, T uint8 arrays (H, W, 3); none if it does not render
+    :param pictures: what ``render()`` gave, T uint8 arrays (H, W, 3); none if it was not asked to, or cannot
     :param weights: of each modality, (T,); empty if the model has none
     :param infos: T dicts, those before the actions
     :param end: the info after the last action, which tells the whole distance, a crash or why it ended
@@ -70,13 +70,14 @@ def record_episode(
     max_steps: int | None = None,
     env_wrapper: Callable[[Env], Env] | None = None,
     deterministic: bool = True,
-    render: bool = True,
+    render: bool = False,
     progress_bar: bool = False,
+    normalizer: VecNormalize | None = None,
 ) -> Recording:
     """Drive an episode and keep it.
 
     :param model: as for :func:`~sb3_have.common.evaluation.evaluate`, under ``VecNormalize`` too if it has its
-        environment; its ``modality_weights`` and ``critic.decompose``, if any, are recorded
+        environment, or ``normalizer`` is given; its ``modality_weights`` and ``critic.decompose``, if any, are recorded
     :param env: id of an environment, or one that was made, which stays open: frame stack and normalisation follow from
         the model
     :param weather: of the episode, for ids of environments that have the keyword; None leaves it to ``env_kwargs``
@@ -85,22 +86,25 @@ def record_episode(
     :param max_steps: to record at most
     :param env_wrapper: applied to the environment, e.g. ``partial(SensorFailure, modality="rgb", kind="black")``
     :param deterministic: whether the policy's mode is driven rather than a sample of it
-    :param render: whether to keep pictures, if the environment can give them
+    :param render: whether to keep the environment's own pictures, if it can give them: a film shows them beside the
+        images of the sensors
     :param progress_bar: shown per step
+    :param normalizer: whose statistics normalise what a model without its environment sees
     :raises ValueError: if the environment's observations do not fit the model's
     :raises TypeError: if ``env`` is vectorized, or is made and ``weather`` or ``env_kwargs`` are given
     """
     keywords = {**(env_kwargs or {}), **({} if weather is None else {"weather": weather})}
-    episode = _Episode(_make(env, keywords, env_wrapper, render), seed)
-    vec_env: VecEnv = DummyVecEnv([lambda: episode])
+    made = _make(env, keywords, render)
     try:
-        vec_env = wrap_as_trained(vec_env, model)
+        made = made if env_wrapper is None else env_wrapper(made)
+        episode = _Episode(made, seed)
+        vec_env = wrap_as_trained(DummyVecEnv([lambda: episode]), model, normalizer)
         limit = min((n for n in (max_steps, getattr(episode.spec, "max_episode_steps", None)) if n), default=None)
         with tqdm(total=limit, unit="step", disable=not progress_bar) as bar:
             recording = _drive(model, vec_env, episode, weather, max_steps, deterministic, render, bar)
     finally:
         if isinstance(env, str):
-            vec_env.close()
+            made.close()
     return recording
 
 
@@ -168,17 +172,16 @@ def _joined(steps: list[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
     return {key: np.concatenate([step[key] for step in steps], axis=-1) for key in (steps or [{}])[0]}
 
 
-def _make(env: str | Env, keywords: dict[str, Any], wrapper: Callable[[Env], Env] | None, render: bool) -> Env:
+def _make(env: str | Env, keywords: dict[str, Any], render: bool) -> Env:
     if isinstance(env, str):
         mode = {"render_mode": "rgb_array"} if render and _renders(env) else {}
         made: Env = gym.make(env, **{**keywords, **mode})
-    elif isinstance(env, VecEnv):
+        return made
+    if isinstance(env, VecEnv):
         raise TypeError("env is vectorized: give the environment inside, the model's wrappers are put on by themselves")
-    elif keywords:
+    if keywords:
         raise TypeError(f"{', '.join(keywords)}: for an environment id; this environment is made already")
-    else:
-        made = env
-    return made if wrapper is None else wrapper(made)
+    return env
 
 
 def _renders(env_id: str) -> bool:
@@ -215,6 +218,3 @@ class _Episode(gym.Env[Any, Any]):
 
     def render(self) -> Any:
         return self.env.render()
-
-    def close(self) -> None:
-        self.env.close()

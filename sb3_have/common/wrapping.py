@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
+import zipfile
 from copy import deepcopy
+from pathlib import Path
 from typing import Any
 
 from stable_baselines3.common.vec_env import (
@@ -15,23 +18,26 @@ from stable_baselines3.common.vec_env import (
 )
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
+from sb3_have.common.archive import loads, read_archive
 from sb3_have.common.episodes import match_observations
 
 
-def wrap_as_trained(vec_env: VecEnv, model: Any) -> VecEnv:
+def wrap_as_trained(vec_env: VecEnv, model: Any, normalizer: VecNormalize | None = None) -> VecEnv:
     """Wrap an environment so that a model reads it as it reads its own.
 
     :param vec_env: the bare environment
     :param model: a model that has its training environment, whose ``VecFrameStack``, ``VecNormalize`` (a copy of its
         statistics, which no longer change), ``VecTransposeImage`` and ``VecExtractDictObs`` are put on in the same
         order; without one, see :func:`~sb3_have.common.episodes.match_observations`
+    :param normalizer: of the training of a model without its environment; see :func:`saved_normalizer`
     :return: rewards are not normalised
     :raises ValueError: if the result has not the observation space of the model, or another wrapper of the training
         changed the observations
     """
     trained: VecEnv | None = getattr(model, "get_env", lambda: None)()
     if trained is None:
-        return match_observations(vec_env, model)
+        vec_env = match_observations(vec_env, model)
+        return vec_env if normalizer is None else _same_layer(normalizer, vec_env)
     layers = []
     while isinstance(trained, VecEnvWrapper):
         layers.append(trained)
@@ -44,6 +50,39 @@ def wrap_as_trained(vec_env: VecEnv, model: Any) -> VecEnv:
             f"  the environment {vec_env.observation_space}, wrapped as in training; make it as that of the training"
         )
     return vec_env
+
+
+def saved_normalizer(file: Path) -> VecNormalize | None:
+    """The ``VecNormalize`` that a model was trained under, without its environment.
+
+    :param file: a checkpoint, or what ``VecNormalize.save`` wrote; it is unpickled
+    :return: None if a checkpoint has none
+    :raises ValueError: if something else is pickled in the file
+    """
+    if not zipfile.is_zipfile(file):
+        with file.open("rb") as pickled:
+            saved = pickle.load(pickled)
+        if not isinstance(saved, VecNormalize):
+            raise ValueError(f"{file} holds a {type(saved).__name__}, not a VecNormalize")
+        return saved
+    with zipfile.ZipFile(file) as archive:
+        if VecNormalize.__name__.encode() not in archive.read("state.pkl"):
+            return None  # which spares us the replay buffer
+    layers = read_archive(file)[2]["environments"].layers
+    states, *_ = loads(layers.pickled, [_Absent()] * len(layers.names))
+    for name, state in zip(layers.names, states, strict=True):
+        if name == VecNormalize.__name__:
+            normalizer = VecNormalize.__new__(VecNormalize)
+            vars(normalizer).update(state)
+            return normalizer
+    return None
+
+
+class _Absent:
+    """An environment, and all that it has, for those who need neither."""
+
+    def __getattr__(self, name: str) -> _Absent:
+        return self
 
 
 def _same_layer(layer: VecEnvWrapper, vec_env: VecEnv) -> VecEnv:
