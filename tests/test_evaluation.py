@@ -1,5 +1,6 @@
 """Evaluation: every driver meets the same episodes, each is counted once, and models see what they were trained on."""
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from fake_drive import ENV_ID
+from rich.console import Console
+from rich.progress import Progress
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 
@@ -190,3 +193,13 @@ def test_table() -> None:
     assert len({len(line) for line in lines}) == 1
     with pytest.raises(ValueError, match="same weathers"):
         format_table({"HAVE": frame, "random": frame[:1]})
+
+
+def test_the_progress_bar_is_seen_within_that_of_a_training(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = io.StringIO()
+    console = Console(file=terminal, stderr=True, force_terminal=True)
+    monkeypatch.setattr("sys.stderr", terminal)
+    with Progress(console=console) as progress:  # as SB3's, which is rich's by way of tqdm
+        progress.add_task("training")
+        evaluate(Watcher(), ENV_ID, ["slow"], n_episodes=2, progress_bar=True)
+        assert "0/2 [" in terminal.getvalue()

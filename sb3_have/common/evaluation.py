@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -41,7 +42,7 @@ def evaluate(
     :param env_kwargs: further keywords for ``gym.make``, the same as in training
     :param n_envs: environments at a time, each in a process of its own when there are several
     :param deterministic: whether the policy's mode is driven rather than a sample of it
-    :param progress_bar: shown per episode
+    :param progress_bar: shown per episode, within a training below that of SB3's ``learn``
     :param env_wrapper: applied to every environment, e.g. ``partial(SensorFailure, modality="rgb", kind="black",
         severity=3)``; a function or class that can be pickled if there are several environments
     :return: a row per weather: ``weather, episodes, return_mean, return_std, distance_mean, distance_std`` [m],
@@ -84,7 +85,9 @@ def evaluate_episodes(
     vec_env: VecEnv = SubprocVecEnv(makers) if n_envs > 1 else DummyVecEnv(makers)  # type: ignore[arg-type]
     try:
         vec_env = match_observations(vec_env, model)
-        with tqdm(total=len(tasks), unit="episode", disable=not progress_bar) as bar:
+        # SB3's bar is drawn by rich, which swallows what others write to stderr as long as it is there
+        below = getattr(sys.stderr, "rich_proxied_file", None)
+        with tqdm(total=len(tasks), unit="episode", disable=not progress_bar, file=below, leave=below is None) as bar:
             done_by_env = drive(model, vec_env, [len(share) for share in shares], deterministic, bar)
     finally:
         vec_env.close()
