@@ -229,6 +229,10 @@ class Run:
         """Drop what was recorded after the checkpoint that is resumed: it will be lived through again."""
         recorded = [*self.out.glob("*monitor.csv"), *self.out.glob("evaluation.csv")]
         if step == 0:
+            log = self.out / "log-0"  # every run has it, before it records anything
+            if recorded and not log.exists():
+                raise ValueError(f"{recorded[0]} is of no run of this program; remove it, or choose another folder")
+            log.mkdir(exist_ok=True)
             for path in recorded:
                 path.unlink()
             return

@@ -69,6 +69,21 @@ def test_folder_of_another_run_is_refused(tmp_path: Path) -> None:
         make_run(tmp_path, seed=1).train(12)
 
 
+def test_records_of_others_are_not_removed(tmp_path: Path) -> None:
+    """But those of a run that was killed before its first checkpoint are."""
+    for name in ("monitor.csv", "3.monitor.csv", "evaluation.csv"):
+        others = tmp_path / name.removesuffix(".csv") / name
+        others.parent.mkdir()
+        others.write_text("of another program")
+        with pytest.raises(ValueError, match=f"{name} is of no run of this program; remove it, or choose another"):
+            make_run(others.parent).train(8)
+        assert others.read_text() == "of another program" and not (others.parent / "model.zip").exists()
+    make_run(tmp_path / "mine").train(12, keep_checkpoint=False)
+    (tmp_path / "mine" / "model.zip").unlink()
+    make_run(tmp_path / "mine").train(12)
+    assert len(pd.read_csv(tmp_path / "mine" / "evaluation.csv")) == 2
+
+
 def test_incomplete_checkpoint_is_ignored(tmp_path: Path) -> None:
     (tmp_path / "checkpoint-30.partial").touch()
     assert newest_checkpoint(tmp_path) is None
