@@ -15,7 +15,7 @@ exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = "sb3_have"
 html_copy_source = False
-smartquotes = False  # what docstrings quote is code to copy
+smartquotes_action = "D"  # dashes alone: what docstrings quote is code to copy
 
 # Anchors for links to headings, as GitHub makes them; ::: fences and LaTeX between dollars
 myst_heading_anchors = 3
