@@ -146,7 +146,7 @@ def load_checkpoint(
         vars(model.actor.action_dist).update({name: noise.to(model.device) for name, noise in state["noise"].items()})
         _skip_once(model.actor, "reset_noise")
     # where the episodes begin anew, so does the noise
-    if state["within_learn"] and model.action_noise is not None and model._last_obs is not None:
+    if state.get("within_learn", True) and model.action_noise is not None and model._last_obs is not None:
         _skip_once(model.action_noise, "reset")  # by which `learn` begins
     restore_callbacks(callbacks, state["callbacks"])
     set_random_states(state["random"])
