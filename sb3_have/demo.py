@@ -71,10 +71,11 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
     run = Run(config, ENV_ID, out, seed=seed, eval_freq=0, save_freq=0, time_limit=time_limit)
     with phase(f"Training for {steps} steps or {time_limit / 60:g} minutes (Ctrl-C: go on with what is learned)"):
         model = run.train(steps, progress_bar=True, keep_checkpoint=False)
+        if not (out / "model.zip").exists():  # interrupted for the second time, in the middle of a step
+            raise KeyboardInterrupt
         (out / "model.zip").replace(out / "havesac_demo.zip")
-        print(
-            f"{model.num_timesteps} steps in {run.seconds:.0f} s, {1e3 * run.seconds / model.num_timesteps:.0f} ms each"
-        )
+        each = 1e3 * run.seconds / max(1, model.num_timesteps)
+        print(f"{model.num_timesteps} steps in {run.seconds:.0f} s, {each:.0f} ms each")
 
     # the environments' processes need the cores now
     th.set_num_threads(1)

@@ -1,10 +1,11 @@
 """The demo from end to end, on a small stand-in for the highway."""
 
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
-from fake_drive import CONFIG, ENV_ID
+from fake_drive import CONFIG, ENV_ID, FakeDrive
 from PIL import Image
 
 from sb3_have import HAVESAC, demo
@@ -28,3 +29,18 @@ def test_the_demo_writes_all_of_its_results_and_can_be_repeated(
     for name in ("learning_curve.png", "modality_weights.png", "drive.gif"):
         with Image.open(tmp_path / name) as picture:
             assert picture.width > 100
+
+
+def test_the_demo_ends_when_it_is_interrupted_before_the_first_step(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def interrupted(self: FakeDrive, action: Any) -> Any:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(demo, "ENV_ID", ENV_ID)
+    config = {**CONFIG, "policy_kwargs": {"features_dim": 4, "net_arch": [8]}}
+    monkeypatch.setattr(demo, "load_config", lambda *_: config)
+    monkeypatch.setattr(FakeDrive, "step", interrupted)
+    with pytest.raises(SystemExit) as stop:
+        demo.main(["--steps", "20", "--out", str(tmp_path)])
+    assert stop.value.code == 130 and "Interrupted" in capsys.readouterr().err
