@@ -87,7 +87,6 @@ class ModalityWeightsCallback(BaseCallback):
             seed=seed,
             env_kwargs=env_kwargs,
             max_steps=max_steps,
-            render=False,
         )
         self._weigh: Callable[[Any], Mapping[str, np.ndarray]] | None = None
         self._readings: dict[str, deque[np.ndarray]] = {}
