@@ -21,8 +21,11 @@ class ParallelLinear(nn.Module):
     def __init__(self, n_nets: int, in_features: int, out_features: int):
         super().__init__()
         bound = 1 / math.sqrt(in_features)
-        self.weight = nn.Parameter(th.empty(n_nets, in_features, out_features).uniform_(-bound, bound))
-        self.bias = nn.Parameter(th.empty(n_nets, 1, out_features).uniform_(-bound, bound))
+        # Registered before they are filled, so that `load_policy` can refuse sizes while they take no memory yet
+        self.weight = nn.Parameter(th.empty(n_nets, in_features, out_features))
+        self.bias = nn.Parameter(th.empty(n_nets, 1, out_features))
+        for parameter in (self.weight, self.bias):
+            nn.init.uniform_(parameter, -bound, bound)
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         return th.baddbmm(self.bias, x, self.weight)

@@ -49,7 +49,7 @@ class HAVESAC(SensorSAC):
     :param target: "bellman": y = r + gamma (1 - done) (min_k H'_k - alpha log pi). "paper": Eq. 10 as it is written,
         both sides of the Bellman equation mixed, y = min_k H'_k(y_g, y_l) with y_j = r + gamma (1 - done)
         (q'_j - alpha log pi). With "convex" re-fusion, and without any ("lve", "gve"), the two are equal; with "free"
-        the second one diverges. The paper's method is ``target="paper", refusion="free", local_coef=0``, and its LVE
+        the second one may diverge. The paper's method is ``target="paper", refusion="free", local_coef=0``, and its LVE
         ``value_estimation="lve", local_coef=0``.
     :param local_coef: weight of the loss that also regresses q_g, q_l and every local value on the target (0 is the
         paper)

@@ -80,8 +80,8 @@ class Reward:
     """
     The reward of a control step of n simulation ticks of dt seconds each.
 
-    - ``"paper"``, per tick and summed: v_s dt - brake_cost brake - steer_cost |steer|
-    - ``"highway"``, as HighwayVision-v0: mean v_s / max_speed - brake_cost brake - steer_cost |steer|
+    - ``"paper"``, per tick and summed: ``v_s dt - brake_cost brake - steer_cost |steer|``
+    - ``"highway"``, as HighwayVision-v0: ``mean v_s / max_speed - brake_cost brake - steer_cost |steer|``
 
     and in both forms less collision_cost times the sum of the impulses of the step's collisions [N s], and less
     crash_penalty in the step that ends in a crash or off the road. v_s is the speed along the lane [m/s], brake lies
