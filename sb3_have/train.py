@@ -140,22 +140,24 @@ class Run:
         self.interrupted = False
         self._rollout_started = self._in_mid_rollout = False
         self._saved_step = -1
+        self._progress_bar = False
 
     def train(self, steps: int, progress_bar: bool = False, keep_checkpoint: bool = True) -> OffPolicyAlgorithm:
         """Train up to a number of steps, from the newest checkpoint if there is one.
 
         :param steps: in all, earlier sessions included
-        :param progress_bar: SB3's
+        :param progress_bar: SB3's, and one for each evaluation
         :param keep_checkpoint: whether to write the replay buffer at the end, so that the run can go on
         :return: the model; also saved as ``model.zip``
         :raises BlockingIOError: if another process works in the folder
         :raises ValueError: if the folder is of another run, or of one that cannot go on
         """
+        self._progress_bar = progress_bar
         self.out.mkdir(parents=True, exist_ok=True)
         with locked(self.out):
-            return self._train(steps, progress_bar, keep_checkpoint)
+            return self._train(steps, keep_checkpoint)
 
-    def _train(self, steps: int, progress_bar: bool, keep_checkpoint: bool) -> OffPolicyAlgorithm:
+    def _train(self, steps: int, keep_checkpoint: bool) -> OffPolicyAlgorithm:
         refuse_older_form(self.out)
         checkpoint = newest_checkpoint(self.out)
         if checkpoint is None and (damaged := checkpoints(self.out)):
@@ -175,7 +177,7 @@ class Run:
             model = self._make_model(checkpoint, env)
             self.evaluate_if_due(model)
             if done < steps:
-                self._learn(model, steps - done, progress_bar)
+                self._learn(model, steps - done)
             if self._in_mid_rollout:
                 return model  # what is on disk is whole
             if keep_checkpoint and model.num_timesteps > done:
@@ -185,13 +187,13 @@ class Run:
         write_atomically(self.out / "model.zip", model.save)
         return model
 
-    def _learn(self, model: OffPolicyAlgorithm, steps: int, progress_bar: bool) -> None:
+    def _learn(self, model: OffPolicyAlgorithm, steps: int) -> None:
         done = model.num_timesteps
         self._rollout_started = self._in_mid_rollout = False
         callback, logger = RunCallback(self), configure(str(self.out / f"log-{done}"), ["csv"])
         model.set_logger(logger)
         try:
-            model.learn(steps, callback=callback, reset_num_timesteps=done == 0, progress_bar=progress_bar)
+            model.learn(steps, callback=callback, reset_num_timesteps=done == 0, progress_bar=self._progress_bar)
         except TrainingStopped:
             self._rollout_started = True
         except KeyboardInterrupt:  # the second one: the first ends the training by itself
@@ -275,6 +277,7 @@ class Run:
             self.eval_env_kwargs,
             n_envs=self.eval_envs,
             env_wrapper=env_wrapper(self.config),
+            progress_bar=self._progress_bar,
         )
         frame.insert(0, "step", step)
         frame.insert(1, "seed", self.seed)

@@ -302,3 +302,10 @@ def test_shipped_configuration_fits_havesac() -> None:
     shapes = {key: space.shape for key, space in model.observation_space.spaces.items()}  # type: ignore[attr-defined]
     assert shapes == {"rgb": (9, 64, 64), "event": (15, 64, 64), "depth": (3, 64, 64)}
     env.close()
+
+
+@pytest.mark.parametrize("progress_bar", [True, False])
+def test_evaluations_have_a_progress_bar(tmp_path: Path, progress_bar: bool, capfd: pytest.CaptureFixture[str]) -> None:
+    make_run(tmp_path).train(12, progress_bar=progress_bar)
+    told = "".join(capfd.readouterr())
+    assert ("2/2" in told and "episode" in told) == progress_bar
