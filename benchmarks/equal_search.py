@@ -7,7 +7,7 @@
 A trial is a set of hyper-parameters, the first the benchmark's own (``benchmarks.reliability_runs``), the others drawn
 from ``SPACE`` by a seeded generator: all methods are tried with the same sets and the same seeds. A method's best is
 the set with the largest mean ``area`` (of the learning curve) over the seeds of the search; it is then trained anew
-with seeds that the search has not seen, so that what is reported of it has not been selected.
+with seeds that the search has not seen and evaluated in other episodes, so that what is reported has not been selected.
 
 Rows of the runs lie in ``<out>/trial-<i>/<method>.csv`` and ``<out>/best-<i>/<method>.csv``, the sets in
 ``<out>/trials.csv``. Runs that are there are not repeated: the command can be stopped and given again.
@@ -27,11 +27,13 @@ import pandas as pd
 
 from benchmarks.reliability import N_UPDATES, OUT, load, missing, run_all, save, summary
 from benchmarks.reliability_report import markdown, report, values
-from benchmarks.reliability_runs import HYPERPARAMETERS, METHODS
+from benchmarks.reliability_runs import EVALUATION_SEED, HYPERPARAMETERS, METHODS
 
 DEFAULT_METHODS = ("gve-wide", "lve", "have")
 SPACE = ("learning_rate", "tau", "gamma", "policy_delay")
-SEARCH_SEEDS = (100, 101)
+SEARCH_SEEDS = (100, 200)
+SEARCH_EVALUATION_SEED = 2_000_000
+"""Of the episodes that decide in the search; those that are reported are ``reliability_runs.EVALUATION_SEED``'s."""
 N_SEEDS = 8
 """Of the runs with each method's best, from 0 on."""
 
@@ -59,21 +61,41 @@ def search(
     methods: Sequence[str], trials: Sequence[Mapping[str, Any]], n_updates: int, n_workers: int, out: Path
 ) -> None:
     """Makes the runs that are missing: every trial of every method, then the best of each method with new seeds."""
-    out.mkdir(parents=True, exist_ok=True)
-    pd.DataFrame(trials).rename_axis("trial").to_csv(out / "trials.csv")
     for i, trial in enumerate(trials):
-        _make(methods, SEARCH_SEEDS, trial, n_updates, n_workers, out / f"trial-{i}")
+        _make(methods, SEARCH_SEEDS, trial, n_updates, n_workers, out / f"trial-{i}", SEARCH_EVALUATION_SEED)
     best = best_trials(methods, len(trials), n_updates, out)
     for i in sorted(set(best.values())):
         chosen = [method for method in methods if best[method] == i]
-        _make(chosen, range(N_SEEDS), trials[i], n_updates, n_workers, out / f"best-{i}")
+        _make(chosen, range(N_SEEDS), trials[i], n_updates, n_workers, out / f"best-{i}", EVALUATION_SEED)
+
+
+def record(trials: Sequence[Mapping[str, Any]], out: Path) -> None:
+    """
+    Writes the trials down, or compares them with those of the runs that are there.
+
+    :raises ValueError: if they are others
+    """
+    file = out / "trials.csv"
+    before = pd.read_csv(file, index_col="trial").to_dict("records") if file.exists() else []
+    if any(dict(trial) != known for trial, known in zip(trials, before, strict=False)):
+        raise ValueError(f"{file} has other trials than those that are drawn now: choose another --out.")
+    if len(trials) > len(before):
+        out.mkdir(parents=True, exist_ok=True)
+        pd.DataFrame(trials).rename_axis("trial").to_csv(file)
 
 
 def _make(
-    methods: Sequence[str], seeds: Sequence[int], trial: Mapping[str, Any], n_updates: int, n_workers: int, folder: Path
+    methods: Sequence[str],
+    seeds: Sequence[int],
+    trial: Mapping[str, Any],
+    n_updates: int,
+    n_workers: int,
+    folder: Path,
+    evaluation_seed: int,
 ) -> None:
     todo = missing(load(folder), methods, seeds, n_updates)
-    for i, rows in enumerate(run_all(todo, n_updates, n_workers, hyperparameters=trial), 1):
+    made = run_all(todo, n_updates, n_workers, hyperparameters=trial, evaluation_seed=evaluation_seed)
+    for i, rows in enumerate(made, 1):
         save(rows, folder)
         told = {measure: value for _, _, _, measure, value in rows}
         print(f"{folder.name} {i}/{len(todo)} {rows[0][0]}-{rows[0][1]}: {summary(told)}", flush=True)
@@ -135,6 +157,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     args = parser.parse_args(arguments)
     signal.signal(signal.SIGTERM, lambda *_: sys.exit("stopped"))  # as by Ctrl-C: the workers are to end too
     trials = draw_trials(args.trials)
+    record(trials, args.out)
     if not args.report:
         search(args.methods, trials, args.updates, args.workers, args.out)
     text = tables(args.methods, trials, args.updates, args.out)

@@ -29,7 +29,7 @@ import pandas as pd
 
 from benchmarks.measure import RESULTS
 from benchmarks.reliability_report import report
-from benchmarks.reliability_runs import METHODS, VARIANTS, run
+from benchmarks.reliability_runs import EVALUATION_SEED, METHODS, VARIANTS, run
 
 DEFAULT_METHODS = ("gve", "gve-wide", "lve", "have", "have-dropout", "have-unsupervised")
 N_UPDATES = 8000
@@ -59,19 +59,22 @@ def run_all(
     n_workers: int,
     task: Mapping[str, Any] | None = None,
     hyperparameters: Mapping[str, Any] | None = None,
+    evaluation_seed: int = EVALUATION_SEED,
 ) -> Iterator[list[tuple[str, int, int, str, float]]]:
     """
-    Rows of each run (method, seed) on a task as it ends, in the order in which they end; ``hyperparameters`` stand in
-    the place of the benchmark's own, for all methods alike.
+    Rows of each run (method, seed) on a task as it ends, in the order in which they end; what else is given is for
+    :func:`benchmarks.reliability_runs.run`, the same for all.
     """
     if n_workers == 1:
         for method, seed in runs:
-            yield _run(method, seed, n_updates, task, hyperparameters)
+            yield _run(method, seed, n_updates, task, hyperparameters, evaluation_seed)
         return
     # Fresh processes: torch's threads do not survive a fork
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(n_workers, mp_context=context) as pool:
-        futures = [pool.submit(_run, method, seed, n_updates, task, hyperparameters) for method, seed in runs]
+        futures = [
+            pool.submit(_run, method, seed, n_updates, task, hyperparameters, evaluation_seed) for method, seed in runs
+        ]
         try:
             for future in as_completed(futures):
                 yield future.result()
@@ -81,15 +84,9 @@ def run_all(
                 worker.terminate()
 
 
-def _run(
-    method: str,
-    seed: int,
-    n_updates: int,
-    task: Mapping[str, Any] | None = None,
-    hyperparameters: Mapping[str, Any] | None = None,
-) -> list[tuple[str, int, int, str, float]]:
+def _run(method: str, seed: int, n_updates: int, *given: Any) -> list[tuple[str, int, int, str, float]]:
     start = time.perf_counter()
-    measures = run(method, seed, n_updates, task, hyperparameters)
+    measures = run(method, seed, n_updates, *given)
     measures["seconds"] = time.perf_counter() - start
     return [(method, seed, n_updates, measure, value) for measure, value in measures.items()]
 

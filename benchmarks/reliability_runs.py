@@ -170,6 +170,7 @@ def run(
     n_updates: int,
     task: Mapping[str, Any] | None = None,
     hyperparameters: Mapping[str, Any] | None = None,
+    evaluation_seed: int = EVALUATION_SEED,
 ) -> dict[str, float]:
     """
     Trains one method and measures it.
@@ -179,6 +180,7 @@ def run(
     :param n_updates: of the critic
     :param task: options of the environment, ``n_blind`` and ``corruption``
     :param hyperparameters: in the place of those of ``HYPERPARAMETERS``, e.g. ``{"learning_rate": 3e-4}``
+    :param evaluation_seed: of the episodes that the learning curve is made of
     :return: measures by name, NaN where a method has no such part:
         ``return_<n>`` mean return after n updates, ``final_return`` the last of them and ``area`` their mean;
         ``weight_auc`` and ``weight_auc_in_step``, see :class:`Drive`;
@@ -196,7 +198,7 @@ def run(
         due = n_updates * (i + 1) // N_EVALUATIONS
         steps = (due - model._n_updates) // UPDATES_PER_STEP + (WARM_UP if i == 0 else 0)
         model.learn(steps * N_ENVS, reset_num_timesteps=i == 0)
-        drive = evaluate(model, **task)
+        drive = evaluate(model, seed=evaluation_seed, **task)
         measures[f"return_{due}"] = float(drive.returns.mean())
     measures["final_return"] = list(measures.values())[-1]
     measures["area"] = float(np.mean(list(measures.values())[:N_EVALUATIONS]))

@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks import equal_search, reliability, reliability_runs
 from benchmarks.equal_search import SEARCH_SEEDS, SPACE, draw_trials
-from benchmarks.reliability_runs import HYPERPARAMETERS, make_model
+from benchmarks.reliability_runs import EVALUATION_SEED, HYPERPARAMETERS, make_model
 
 Made = list[tuple[str, int, float]]
 
@@ -20,7 +20,10 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Made:
     """
     made: Made = []
 
-    def run(method: str, seed: int, n_updates: int, task: Any, hyperparameters: Any) -> dict[str, float]:
+    def run(
+        method: str, seed: int, n_updates: int, task: Any, hyperparameters: Any, evaluation_seed: int
+    ) -> dict[str, float]:
+        assert (evaluation_seed == EVALUATION_SEED) == (seed not in SEARCH_SEEDS)
         learning_rate = hyperparameters["learning_rate"]
         made.append((method, seed, learning_rate))
         area = (learning_rate if method == "gve" else 1 / learning_rate) * (1 if seed in SEARCH_SEEDS else 10)
@@ -63,9 +66,20 @@ def test_a_stopped_search_goes_on(tmp_path: Path, made: Made) -> None:
     equal_search.search(["gve"], trials[:1], 10, 1, tmp_path)
     n_runs = len(made)
     file = tmp_path / "trial-0" / "gve.csv"
-    file.write_text("".join(line for line in file.read_text().splitlines(keepends=True) if ",101," not in line))
+    file.write_text("".join(line for line in file.read_text().splitlines(keepends=True) if ",200," not in line))
     equal_search.search(["gve"], trials[:1], 10, 1, tmp_path)
-    assert made[n_runs:] == [("gve", 101, trials[0]["learning_rate"])]
+    assert made[n_runs:] == [("gve", 200, trials[0]["learning_rate"])]
+
+
+def test_runs_of_other_trials_are_refused(tmp_path: Path, made: Made, monkeypatch: pytest.MonkeyPatch) -> None:
+    arguments = ["--methods", "gve", "--workers", "1", "--out", str(tmp_path), "--trials"]
+    equal_search.main([*arguments, "3"])
+    equal_search.main([*arguments, "2"])
+    assert len((tmp_path / "trials.csv").read_text().splitlines()) == 1 + 3, "the record keeps what there was"
+    drawn = draw_trials(3)
+    monkeypatch.setattr(equal_search, "draw_trials", lambda n_trials: [drawn[0], {**drawn[1], "tau": 0.5}, drawn[2]])
+    with pytest.raises(ValueError, match=r"trials\.csv has other trials .* choose another --out"):
+        equal_search.main([*arguments, "3"])
 
 
 def test_hyperparameters_reach_the_model(monkeypatch: pytest.MonkeyPatch) -> None:

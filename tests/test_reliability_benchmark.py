@@ -194,7 +194,7 @@ def test_a_run_has_all_measures_and_repeats_itself() -> None:
     }
 
 
-def fake_run(method: str, seed: int, n_updates: int, task: Any = None, hyperparameters: Any = None) -> dict[str, float]:
+def fake_run(method: str, seed: int, n_updates: int, *given: Any) -> dict[str, float]:
     names = ("final_return", "area", "weight_auc", "value_bias", "kept_black", "kept_frozen", "kept_noise")
     return dict.fromkeys(names, float(seed)) | {"return_10": 1.0, "weight_auc": float("nan")}
 
@@ -202,7 +202,7 @@ def fake_run(method: str, seed: int, n_updates: int, task: Any = None, hyperpara
 def test_runs_are_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[tuple[str, int]] = []
 
-    def run(method: str, seed: int, n_updates: int, task: Any = None, hyperparameters: Any = None) -> dict[str, float]:
+    def run(method: str, seed: int, n_updates: int, *given: Any) -> dict[str, float]:
         if len(made) == 3:
             raise KeyboardInterrupt
         made.append((method, seed))
