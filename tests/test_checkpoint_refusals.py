@@ -2,6 +2,7 @@
 
 import copy
 import fcntl
+import re
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -180,6 +181,52 @@ def test_settings_that_are_the_same() -> None:
     first.reset()
     restore_environments(second, environments_state(first))
     assert second.render_mode == "rgb_array" and second.render() is not None
+
+
+class Made(Drifting):
+    """Takes a setting of any kind, and writes into it where it can."""
+
+    def __init__(self, setting: Any = ("rgb", "depth")):
+        super().__init__()
+        if isinstance(setting, dict):
+            setting["level"] = id(self)
+
+
+gym.register("Made-v0", Made)
+
+SAME: dict[str, tuple[Any, Any]] = {
+    "list": (("rgb", "depth"), ["rgb", "depth"]),
+    "nested": ([(1, "a"), [np.int64(2)]], ((1.0, "a"), (2,))),
+    "float": (np.float64(1), 1),
+    "NaN": (float("nan"), np.float32("nan")),
+    "bool": (np.True_, True),
+    "written dict": ({}, {}),
+    "other dict": ({"a": 1}, {"b": 2}),
+    "set": ({"a"}, {"b"}),
+    "array": (np.zeros(3), [0, 0, 0]),
+    "object": (object(), None),
+}
+
+
+@pytest.mark.parametrize("case", SAME)
+def test_settings_that_are_the_same_or_cannot_be_compared(case: str, tmp_path: Path) -> None:
+    """A file of another process writes what the same settings were in other types; some the environment has changed."""
+    first, second = (DummyVecEnv([partial(gym.make, "Made-v0", setting=each)]) for each in SAME[case])
+    first.reset()
+    restore_environments(second, environments_state(first))
+    restore_environments(first, environments_state(second))
+
+
+@pytest.mark.parametrize(
+    ("then", "now"), [(1, True), (True, 1), (1.0, 1.5), ("a", ["a"]), (None, 0), ((1, 2), (1,)), (["a"], ["b"])]
+)
+def test_plain_settings_that_differ(then: Any, now: Any) -> None:
+    first, second = (DummyVecEnv([partial(gym.make, "Made-v0", setting=each)]) for each in (then, now))
+    first.reset()
+    with pytest.raises(
+        ValueError, match=re.escape(f"with setting: {then!r}, and it was given one with setting: {now!r}")
+    ):
+        restore_environments(second, environments_state(first))
 
 
 def test_other_environment_after_loading(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import inspect
 import random
 import re
 from collections.abc import Sequence
+from numbers import Number
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -34,7 +35,7 @@ class LayersState(NamedTuple):
     names: list[str]
     pickled: bytes
     lost: list[str]  # what cannot be pickled; not empty: the rest is of no use but for what is random in it
-    settings: Sequence[dict[str, str]] = ()  # what they were made with
+    settings: Sequence[dict[str, Any]] = ()  # what they were made with, as far as it can be compared
 
 
 class EnvironmentsState(NamedTuple):
@@ -70,7 +71,7 @@ class ResumableEnv(gym.Wrapper[Any, Any, Any, Any]):
         """State of the environment and of the process's own random numbers."""
         return _capture(_gym_layers(self), (random.getstate(), np.random.get_state()))
 
-    def checkpoint_layers(self) -> list[tuple[str, dict[str, str]]]:
+    def checkpoint_layers(self) -> list[tuple[str, dict[str, Any]]]:
         """Classes that the state is of, outermost first, and what they were made with."""
         return _described(_gym_layers(self))
 
@@ -110,8 +111,9 @@ def environments_state(vec_env: VecEnv, shared: Any = None) -> EnvironmentsState
 def restore_environments(vec_env: VecEnv, state: EnvironmentsState) -> Any:
     """Put environments into a state.
 
-    :param vec_env: made like those that the state is of; other settings, of which gymnasium tells what was given to
-        ``gym.make`` and to its own wrappers, would be overridden by the state and are refused
+    :param vec_env: made like those that the state is of. Other settings would be overridden by the state, and are
+        refused where that can be told: of what gymnasium knows to have been given to ``gym.make`` and to its own
+        wrappers, numbers, text, None and sequences of these are compared; dicts, sets, arrays and objects are not
     :param state: of :func:`environments_state`
     :return: what was ``shared``
     :raises ValueError: if they have other wrappers or settings, or are more or fewer
@@ -213,21 +215,37 @@ def _without_addresses(text: str) -> str:
     return re.sub(r" at 0x[0-9a-fA-F]+", "", text)
 
 
-def _described(layers: Sequence[Any]) -> list[tuple[str, dict[str, str]]]:
+def _described(layers: Sequence[Any]) -> list[tuple[str, dict[str, Any]]]:
     return [(type(layer).__qualname__, _settings(layer)) for layer in layers]
 
 
-def _settings(layer: Any) -> dict[str, str]:
-    """What an environment or wrapper was made with, as far as gymnasium keeps it, but for how it draws."""
+def _settings(layer: Any) -> dict[str, Any]:
+    """Plain values that an environment or wrapper was made with and gymnasium keeps, but for how it draws."""
     settings: dict[str, Any] = vars(layer).get("_saved_kwargs", {})  # of gymnasium's own wrappers
     if not isinstance(layer, VecEnv | gym.Wrapper) and layer.spec is not None:
         parameters = inspect.signature(type(layer).__init__).parameters
         defaults = {name: each.default for name, each in parameters.items() if each.default is not each.empty}
         settings = defaults | layer.spec.kwargs
-    return {name: _without_addresses(repr(value)) for name, value in settings.items() if name != "render_mode"}
+    return {name: value for name, value in settings.items() if name != "render_mode" and _is_plain(value)}
 
 
-def _check_made_alike(state: LayersState, described: list[tuple[str, dict[str, str]]]) -> None:
+def _is_plain(value: Any) -> bool:
+    """Whether a value stays what it was given as: an environment may write into dicts and objects."""
+    if isinstance(value, list | tuple):
+        return all(map(_is_plain, value))
+    return value is None or isinstance(value, str | Number | np.bool_)
+
+
+def _are_same(first: Any, second: Any) -> bool:
+    """Whether plain values are the same, whatever the types of numbers and sequences; true is not 1."""
+    if isinstance(first, list | tuple) and isinstance(second, list | tuple):
+        return len(first) == len(second) and all(map(_are_same, first, second))
+    if isinstance(first, bool | np.bool_) != isinstance(second, bool | np.bool_):
+        return False
+    return bool(first == second or (first != first and second != second))  # NaN
+
+
+def _check_made_alike(state: LayersState, described: list[tuple[str, dict[str, Any]]]) -> None:
     """
     :raises ValueError: if layers are not those of a state, or were made with other settings
     """
@@ -240,12 +258,12 @@ def _check_made_alike(state: LayersState, described: list[tuple[str, dict[str, s
     if state.lost:
         return  # their settings stay as they are
     for (name, given), saved in zip(described, state.settings, strict=False):
-        for key in sorted(given.keys() | saved.keys()):
-            if (now := given.get(key, "not given")) != (then := saved.get(key, "not given")):
+        for key in sorted(given.keys() & saved.keys()):
+            if not _are_same(saved[key], given[key]):
                 raise ValueError(
-                    f"the checkpoint's {name} was made with {key}: {then}, and it was given one with {key}: {now}, "
-                    "which its state would override; make it as in the training that wrote it, and to train on in "
-                    "another environment, give that to the loaded model by `set_env`"
+                    f"the checkpoint's {name} was made with {key}: {saved[key]!r}, and it was given one with {key}: "
+                    f"{given[key]!r}, which its state would override; make it as in the training that wrote it, and "
+                    "to train on in another environment, give that to the loaded model by `set_env`"
                 )
 
 
