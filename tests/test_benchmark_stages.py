@@ -5,11 +5,12 @@ import signal
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import pytest
 from fake_drive import ENV_ID
 from tiny_grid import FAILURES, TINY, make_grid, read
 
-from sb3_have import train
+from sb3_have import HAVESAC, train
 from sb3_have.benchmark import stages
 from sb3_have.benchmark.grid import Job
 from sb3_have.benchmark.results import is_finished, merge
@@ -134,3 +135,13 @@ def test_remains_of_a_checkpoint_are_in_nobodys_way(tmp_path: Path) -> None:
     (remains / "model.zip").touch()
     assert run_job(job, tmp_path)
     assert not [*(tmp_path / job.name).glob("checkpoint*")]
+
+
+def test_parameters_are_those_that_are_trained() -> None:
+    """A policy has DeepMDP's heads in any case; where that loss is off, they get no gradient."""
+    kwargs: dict[str, Any] = {"policy_kwargs": TINY["policy_kwargs"], "buffer_size": 10}
+    sac, deepmdp = (HAVESAC("MultiInputPolicy", gym.make(ENV_ID), auxiliary=a, **kwargs) for a in (None, "deepmdp"))
+    heads = sum(parameter.numel() for parameter in sac.policy.auxiliary.parameters())
+    assert heads > 0 and stages.n_parameters(sac) == stages.n_parameters(deepmdp) - heads
+    trained = [*deepmdp.critic.parameters(), *deepmdp.actor.parameters(), *deepmdp.policy.auxiliary.parameters()]
+    assert stages.n_parameters(deepmdp) == sum(parameter.numel() for parameter in trained)

@@ -139,11 +139,20 @@ def _drop_checkpoints(folder: Path) -> None:
 
 
 def n_parameters(model: OffPolicyAlgorithm) -> int:
-    """Numbers that the training changes by gradients, in actor, critic and all that belongs to them."""
+    """Numbers that the training changes by gradients, in actor, critic and all that belongs to them.
+
+    Target networks are left out, and heads of auxiliary losses that are off: a policy has DeepMDP's in any case.
+    """
+    left_out = ["critic_target."]
+    if isinstance(model, HAVESAC):
+        heads = model.policy.auxiliary.items()
+        left_out += [
+            f"auxiliary.{name}." for name, head in heads if model.auxiliary_coefs.keys().isdisjoint(head.terms)
+        ]
     return sum(
         parameter.numel()
         for name, parameter in model.policy.named_parameters()
-        if parameter.requires_grad and not name.startswith("critic_target.")
+        if parameter.requires_grad and not name.startswith(tuple(left_out))
     )
 
 
