@@ -118,12 +118,23 @@ def detached_refusion() -> AbstractContextManager[None]:
     return _together(lambda: patch.object(MultiModalCritic, "values", broken))
 
 
+def reversed_actor() -> AbstractContextManager[None]:
+    """The actor descends the value instead of climbing it: L_pi = alpha log pi + min_k H_k; the target is sound."""
+    min_q = MultiModalCritic.min_q
+
+    def broken(critic: MultiModalCritic, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        q = min_q(critic, features, actions)
+        return -q if th.is_grad_enabled() else q  # the target needs no gradient
+
+    return _together(lambda: patch.object(MultiModalCritic, "min_q", broken))
+
+
 FAULTS: Mapping[str, Callable[[], AbstractContextManager[None]]] = MappingProxyType(
     {
         fault.__name__: fault
         for fault in (
             weights_of_wrong_step, unsupervised_locals, target_without_entropy, frozen_refusion, swapped_modalities,
-            ends_ignored, frozen_local_targets, detached_refusion,
+            ends_ignored, frozen_local_targets, detached_refusion, reversed_actor,
         )
     }
 )  # fmt: skip

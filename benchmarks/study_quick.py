@@ -5,7 +5,8 @@
     OMP_NUM_THREADS=1 python -m benchmarks.study_quick --record                       # sound code, and every fault
 
 The default form of HAVE learns a known Q (``benchmarks.known_q``) and, if that is within bounds, to drive on
-ReliabilityDrive-v0 (``benchmarks.reliability``), in two processes. The worst seed of each measure counts. ``--record``
+ReliabilityDrive-v0 (``benchmarks.reliability``), in two processes. The worst seed of each measure counts; of the
+return, which varies most, the mean of the seeds does, and one that does nothing (59.4) is out of bounds. ``--record``
 does so for several sets of seeds of the sound code and for every fault of ``benchmarks.planted_faults``, and writes
 ``benchmarks/results/study_quick/faults.csv`` and ``faults.md``, with what was printed.
 """
@@ -41,12 +42,14 @@ N_PROCESSES = 2
 
 
 class Bound(NamedTuple):
-    """What a measure has to be in every seed, and where to look if it is not."""
+    """What a measure has to be in every seed, or on average, and where to look if it is not."""
 
     measure: str
     lower: float
     upper: float
     suspects: str
+    of_mean: bool = False
+    """Whether the mean over the seeds is bounded rather than each of them."""
 
     def excess(self, value: float) -> float:
         """How far a value is out of bounds; within them, a negative distance to the nearer one."""
@@ -65,7 +68,7 @@ KNOWN_Q = (
     Bound("refusion_moved", 1, 1, "the gradient of the re-fusion: its parameters stayed what they were"),
 )
 DRIVING = (
-    Bound("final_return", 40, math.inf, "actor or entropy temperature, if the known Q is within bounds"),
+    Bound("final_return", 62, math.inf, "actor or entropy temperature, if the known Q is within bounds", of_mean=True),
     Bound("weight_auc", 0.8, 1, "as above, where actions follow from the values"),
     Bound("negative_gradient", 0, 0, "as above, at other values"),
 )
@@ -78,7 +81,7 @@ class Verdict(NamedTuple):
     suite: str
     bound: Bound
     worst: float
-    """The value of the seed that is furthest out."""
+    """The value of the seed that is furthest out, or the mean over the seeds where the bound is of that."""
     ok: bool
 
 
@@ -89,8 +92,12 @@ def judge(suite: str, measured: Sequence[Mapping[str, float]]) -> list[Verdict]:
     :return: one verdict for each bound; NaN and infinity are out of any bounds
     """
     bounds = SUITES[suite]
-    worst = [max((row[bound.measure] for row in measured), key=bound.excess) for bound in bounds]
-    return [Verdict(suite, bound, value, bound.excess(value) <= 0) for bound, value in zip(bounds, worst, strict=True)]
+    verdicts = []
+    for bound in bounds:
+        values = [row[bound.measure] for row in measured]
+        value = math.fsum(values) / len(values) if bound.of_mean else max(values, key=bound.excess)
+        verdicts.append(Verdict(suite, bound, value, bound.excess(value) <= 0))
+    return verdicts
 
 
 def describe(verdicts: Sequence[Verdict]) -> str:
@@ -99,7 +106,8 @@ def describe(verdicts: Sequence[Verdict]) -> str:
     failures = []
     for suite, bound, worst, ok in verdicts:
         limits = f"[{bound.lower:g}, {bound.upper:g}]"
-        lines.append(f"{suite:10}{bound.measure:20}{worst:12.3f}   {limits:16}{'yes' if ok else 'NO'}")
+        name = f"{bound.measure} (mean)" if bound.of_mean else bound.measure
+        lines.append(f"{suite:10}{name:20}{worst:12.3f}   {limits:16}{'yes' if ok else 'NO'}")
         if not ok:
             failures.append(f"OUT OF BOUNDS: {suite}, {bound.measure} {worst:.3f}; look at: {bound.suspects}")
     return "\n".join(lines + failures)

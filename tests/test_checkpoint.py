@@ -192,7 +192,8 @@ def test_training_that_a_callback_ends(tmp_path: Path) -> None:
         def _on_step(self) -> bool:
             return self.num_timesteps < 25
 
-    sac(drifting()).learn(40, [ResumableCheckpointCallback(tmp_path, 10), Ends()])
+    with pytest.warns(UserWarning, match=r"A callback ended the training in step 25, .* no checkpoint of it"):
+        sac(drifting()).learn(40, [ResumableCheckpointCallback(tmp_path, 10), Ends()])
     assert [path.name for path in checkpoints(tmp_path)] == ["checkpoint-10", "checkpoint-20"]
 
 

@@ -2,6 +2,7 @@
 
 import copy
 import fcntl
+import gc
 import re
 from functools import partial
 from pathlib import Path
@@ -52,10 +53,26 @@ def test_folder_of_another_training(tmp_path: Path) -> None:
         earlier.learn(5, callback, reset_num_timesteps=False)
 
 
+def test_second_call_of_learn(tmp_path: Path) -> None:
+    """By default SB3 counts the steps from 0 again."""
+    callback = ResumableCheckpointCallback(tmp_path, 10)
+    model = make_model().learn(20, callback)
+    told = (
+        r"to train the same model on, `learn\(..., reset_num_timesteps=False\)`, after `model.num_timesteps = 20` where"
+    )
+    with pytest.raises(ValueError, match=told):
+        model.learn(10, callback)
+    model.num_timesteps = 20
+    model.learn(10, callback, reset_num_timesteps=False)
+    assert checkpoints(tmp_path)[-1].name == "checkpoint-30"
+
+
 def test_damaged_later_checkpoints_are_in_nobodys_way(tmp_path: Path) -> None:
     (tmp_path / "checkpoint-20").write_bytes(b"damaged")
     make_model().learn(9, ResumableCheckpointCallback(tmp_path, 10))
     assert [path.name for path in checkpoints(tmp_path)] == ["checkpoint-9", "checkpoint-20"]
+    with pytest.raises(ValueError, match="checkpoint-9 is later than this training, which has 0 steps"):
+        make_model().learn(9, ResumableCheckpointCallback(tmp_path, 10))
 
 
 class Fails(BaseCallback):
@@ -63,18 +80,61 @@ class Fails(BaseCallback):
         raise ZeroDivisionError
 
 
+class Watches(BaseCallback):
+    """Whether another process could begin in a folder now."""
+
+    def __init__(self, folder: Path):
+        super().__init__()
+        self.folder = folder
+
+    def _on_step(self) -> bool:
+        with pytest.raises(BlockingIOError):
+            take(self.folder)
+        return True
+
+
+def take(folder: Path) -> None:
+    with (folder / ".lock").open("w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)  # as another process does
+
+
 def test_folder_is_for_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checkpoint, "locked", partial(files.locked, patience=0.0))
     callback = ResumableCheckpointCallback(tmp_path, 10)
     with (tmp_path / ".lock").open("w") as other:
-        fcntl.flock(other, fcntl.LOCK_EX)  # as another process does
-        with pytest.raises(BlockingIOError, match="another process works in"):
+        fcntl.flock(other, fcntl.LOCK_EX)
+        (tmp_path / "checkpoint-20").write_bytes(b"the other process's, in the midst of renaming")
+        with pytest.raises(
+            BlockingIOError, match=r"another process works in.*; a notebook .* until its kernel is rest"
+        ):
             make_model().learn(9, callback)
+    make_model().learn(9, [callback, Watches(tmp_path)])
+    take(tmp_path)
+    with pytest.raises(ValueError, match="checkpoint-9 is later"):
+        make_model().learn(9, callback)
+    take(tmp_path)
+
+
+def test_folder_after_a_training_that_failed(tmp_path: Path) -> None:
+    """The process keeps it, for itself alone, and gives it back when it has trained in it again."""
+    callback = ResumableCheckpointCallback(tmp_path, 10)
     with pytest.raises(ZeroDivisionError):
         make_model().learn(9, [callback, Fails()])
-    make_model().learn(9, callback)
-    with (tmp_path / ".lock").open("w") as other:
-        fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    with pytest.raises(BlockingIOError):
+        take(tmp_path)
+    again = ResumableCheckpointCallback(tmp_path, 10)  # as when a cell of a notebook is run again
+
+    class Forgets(BaseCallback):
+        def _on_training_start(self) -> None:
+            nonlocal callback
+            del callback
+            gc.collect()
+
+        def _on_step(self) -> bool:
+            return True
+
+    make_model().learn(9, [again, Forgets(), Watches(tmp_path)])
+    take(tmp_path)
 
 
 def test_algorithm_that_is_on_policy(tmp_path: Path) -> None:
@@ -192,7 +252,7 @@ class Made(Drifting):
             setting["level"] = id(self)
 
 
-gym.register("Made-v0", Made)
+gym.register("Made-v0", lambda **kwargs: Made(**kwargs))
 
 SAME: dict[str, tuple[Any, Any]] = {
     "list": (("rgb", "depth"), ["rgb", "depth"]),

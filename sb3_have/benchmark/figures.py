@@ -5,15 +5,13 @@ They draw on ``Figure`` objects: a user's pyplot stays untouched. No text is sma
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
 import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
+from sb3_have.benchmark.breakdown import cases_of
 from sb3_have.benchmark.reading import DISTANCE, Measure, Results, ordered
 from sb3_have.benchmark.tables import score_table
 from sb3_have.common.evaluation import performance_profile
@@ -35,27 +33,22 @@ WIDTH = 9.0
 PER_PANEL = 7
 """Curves of a panel, the reference not counted: more cannot be told apart."""
 
-
-KEPT = (-1.0, 2.0)
-"""Shares that a figure shows at most: that of a return near zero can be anything."""
-
-
 # Okabe and Ito's colours, told apart by colour-blind people too; a method of the same family as another has its colour
 # with another line, marker and hatch.
 STYLES = {
-    "rgb": Style("#D55E00", marker="s"),
-    "event": Style("#0072B2", marker="^"),
-    "depth": Style("#009E73", marker="v"),
-    "sac": Style("#888888", marker="D"),
+    "rgb": Style("#D55E00", marker="s", hatch="\\\\\\"),
+    "event": Style("#0072B2", marker="^", hatch="---"),
+    "depth": Style("#009E73", marker="v", hatch="|||"),
+    "sac": Style("#888888", marker="D", hatch="xxx"),
     "deepmdp": Style("#56B4E9", marker="P"),
     "gve": Style("#56B4E9", "--", "p", "///"),
-    "gve-wide": Style("#E69F00", marker="X"),
+    "gve-wide": Style("#E69F00", marker="X", hatch="+++"),
     "drq": Style("#888888", "--", "d", "///"),
     "transfuser": Style("#009E73", "--", ">", "///"),
     "efnet": Style("#E69F00", "--", "<", "///"),
     "tqc": Style("#D55E00", "--", "h", "///"),
     "crossq": Style("#0072B2", "--", "8", "///"),
-    "lve": Style("#CC79A7", marker="*"),
+    "lve": Style("#CC79A7", marker="*", hatch="ooo"),
     "lve-paper": Style("#CC79A7", ":", "p", "..."),
     "have-paper": Style("#000000", ":", "p", "..."),
     "have": Style("#000000"),
@@ -72,11 +65,12 @@ def style(method: str) -> Style:
 def plot_progress(results: Results, reference: str = "have") -> Figure:
     """Mean over weathers against training steps: a row of panels for every few methods, a column for each measure.
 
-    A line is the mean over seeds, its band reaches from the lowest to the highest of them. Only the seeds that have
-    come as far as their method's furthest count: a mean of other seeds at other steps would jump where no run did.
+    A line is the mean over seeds; the reference's band reaches from the lowest to the highest of them, several bands
+    could not be told apart. Only the seeds that have come as far as their method's furthest count: a mean of other
+    seeds at other steps would jump where no run did.
 
     :param results: with ``evaluations``
-    :param reference: method drawn in every panel
+    :param reference: method drawn in every panel, the only one with a band
     """
     curves = {method: learning_curves(results["evaluations"], method) for method in results.methods}
     methods = [method for method, of_method in curves.items() if len(of_method)]
@@ -122,7 +116,7 @@ def _draw_curve(axis: Axes, method: str, curves: pd.DataFrame, measure: Measure,
     by_step = curves.groupby("step")[f"{measure.name}_mean"]
     mean, lowest, highest = by_step.mean(), by_step.min(), by_step.max()
     seeds = curves["seed"].nunique()
-    band = (lowest, highest) if seeds > 1 else None
+    band = (lowest, highest) if emphasis and seeds > 1 else None
     draw_curve(axis, mean.index, mean, band, style(method), f"{method} ({seeds})", emphasis)
 
 
@@ -138,7 +132,7 @@ def _draw_drivers(axis: Axes, drivers: pd.DataFrame, measure: Measure) -> None:
 
 
 def plot_scores(results: Results, reference: str = "have", table: pd.DataFrame | None = None) -> Figure:
-    """Interquartile mean of each method over seeds and weathers, with its 95% interval where there are several seeds.
+    """Interquartile mean of each method over seeds and weathers, with its 95% interval where there are seeds enough.
 
     :param results: with finished runs
     :param reference: as for :func:`~sb3_have.benchmark.tables.score_table`
@@ -203,12 +197,21 @@ def plot_profiles(results: Results, measure: Measure = DISTANCE, reference: str 
     figure = Figure(figsize=(WIDTH, 3.4), layout="constrained")
     axes = figure.subplots(1, len(groups), sharex=True, sharey=True, squeeze=False)[0]
     for axis, group in zip(axes, groups, strict=True):
-        for method in ordered([*group, *([reference] if reference in methods else [])]):
+        for number, method in enumerate(ordered([*group, *([reference] if reference in methods else [])])):
             look = style(method)
             profile = performance_profile(scores[method], thresholds)
             width = 2.5 if method == reference else 1.5
             axis.step(
-                thresholds, profile, where="post", color=look.colour, linestyle=look.line, linewidth=width, label=method
+                thresholds,
+                profile,
+                where="post",
+                color=look.colour,
+                linestyle=look.line,
+                linewidth=width,
+                marker=look.marker,
+                markersize=6,
+                markevery=(0.02 * number, 0.16),  # parts of the axes, so that markers of several lines are apart
+                label=method,
             )
         axis.set(xlabel=f"threshold of {measure.label}", ylim=(-0.03, 1.03))
         axis.grid(alpha=0.3)
@@ -270,51 +273,43 @@ def plot_episode_weights(results: Results, method: str, seed: int) -> Figure:
     return figure
 
 
-def plot_kept(table: pd.DataFrame, measure: Measure) -> Figure:
-    """What every method keeps when a sensor fails: a row for each modality, a group of bars for each kind of failure.
+def plot_failures(table: pd.DataFrame, measure: Measure) -> Figure:
+    """What every method reaches under each failure: a row for each modality, in it a group of bars for each kind of
+    failure beside one with sound sensors; whiskers from the lowest to the highest seed.
 
-    :param table: from :func:`~sb3_have.benchmark.tables.kept_table`
-    :param measure: what is kept; the axis shows no more of it than :data:`KEPT`
+    :param table: from :func:`~sb3_have.benchmark.breakdown.failure_table`
+    :param measure: the height of the bars
     """
-    modalities = list(modality_styles(set(table["modality"])))
+    modalities = list(modality_styles(set(table.loc[table["kind"] != "none", "modality"])))
     methods = ordered(set(table["method"]))
-    figure = Figure(figsize=(WIDTH, 2.3 * len(modalities) + 0.9), layout="constrained")
+    figure = Figure(figsize=(WIDTH, 2.5 * len(modalities) + 0.9), layout="constrained")
     axes = figure.subplots(len(modalities), 1, sharey=True, squeeze=False)[:, 0]
     width, handles = 0.84 / len(methods), {}
     for axis, modality in zip(axes, modalities, strict=True):
-        rows = table[table["modality"] == modality]
-        cases = list(dict.fromkeys(zip(rows["kind"], rows["severity"], strict=True)))
+        cases = {case: name for case, name in cases_of(table).items() if case[0] in ("none", modality)}
         for number, method in enumerate(methods):
-            shares = _shares(rows[rows["method"] == method], measure)
-            known = [case for case in cases if case in shares and np.isfinite(shares[case]["kept"])]
-            places = [cases.index(case) + (number - (len(methods) - 1) / 2) * width for case in known]
-            if not known:
+            rows = {
+                (row["modality"], row["kind"], row["severity"]): row
+                for row in table[table["method"] == method].to_dict("records")
+            }
+            known = [case for case in cases if case in rows]
+            if len(known) < 2:  # a method without this modality
                 continue
+            places = [[*cases].index(case) + (number - (len(methods) - 1) / 2) * width for case in known]
+            heights, lowest, highest = (
+                [rows[case][f"{measure.name}_{what}"] for case in known] for what in ("mean", "lowest", "highest")
+            )
             look = style(method)
-            heights = [shares[case]["kept"] for case in known]
-            bars = axis.bar(
+            handles[method] = axis.bar(
                 places, heights, 0.9 * width, color=look.colour, hatch=look.hatch, edgecolor="white", linewidth=0.5
             )
-            handles[method] = bars
-            if max(shares[case]["seeds"] for case in known) > 1:
-                lowest, highest = ([shares[case][name] for case in known] for name in ("lowest", "highest"))
+            if max(rows[case]["seeds"] for case in known) > 1:
                 draw_whiskers(axis, places, lowest, highest)
-        labels = [f"{kind} {severity}" if len(set(rows["severity"])) > 1 else kind for kind, severity in cases]
-        axis.set_xticks(range(len(cases)), labels)
+        axis.set_xticks(range(len(cases)), [*cases.values()])
         axis.set_title(f"{modality} fails", fontsize=MEDIUM)
-        axis.axhline(1.0, color="0.35", linestyle="--", linewidth=1)
-        axis.set(ylabel=f"{measure.name} kept", axisbelow=True)
+        axis.axhline(0.0, color="0.35", linewidth=1)
+        axis.set(ylabel=measure.label, axisbelow=True)
         axis.grid(axis="y", alpha=0.3)
-    lowest, highest = axes[0].get_ylim()
-    axes[0].set_ylim(max(lowest, KEPT[0]), min(highest, KEPT[1]))
     shown = [method for method in methods if method in handles]
     legend_above(figure, [handles[method] for method in shown], shown)
     return figure
-
-
-def _shares(rows: pd.DataFrame, measure: Measure) -> Mapping[tuple[str, int], dict[str, Any]]:
-    names = ("kept", "lowest", "highest", "seeds")
-    return {
-        (row["kind"], row["severity"]): {name: row[f"{measure.name}_{name}"] for name in names}
-        for row in rows.to_dict("records")
-    }

@@ -12,19 +12,20 @@ import argparse
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from sb3_have.benchmark import figures, tables
+from sb3_have.benchmark import breakdown, figures, tables
 from sb3_have.benchmark.provenance import provenance
-from sb3_have.benchmark.reading import RETURN, Measure, Results, ResultsError, ordered, read_results
+from sb3_have.benchmark.reading import DISTANCE, RETURN, Measure, Results, ResultsError, ordered, read_results
 from sb3_have.plotting import weather_weights
 
 DPI = 110
 INTERVALS = (
     "Intervals are 95% percentile intervals of a bootstrap (2,000 resamples) that draws whole seeds, each with all its "
     "weathers: a seed that is good in one weather tends to be good in all. With few seeds they are narrower than they "
-    "should be; with three, they hold the truth in some 75% of cases."
+    "should be: with three, they hold the truth in some 75% of cases, with eight in 90%."
 )
 
 
@@ -133,15 +134,15 @@ class Report:
         parts = ["## All weathers together"]
         for measure in reversed(self.results.measures):
             parts.append(tables.score_markdown(self.scores, measure, self.reference))
-        single = [name for name in self.methods if len(self.results.finished_seeds(name)) == 1]
+        few = [name for name in self.methods if len(self.results.finished_seeds(name)) < tables.MIN_SEEDS]
         caption = (
             "A score is the mean over the episodes of a seed in a weather. IQM: mean of the scores of all seeds and "
             "weathers without the lowest and the highest quarter. "
             f"P({self.reference} is better): how often a run of `{self.reference}` has the higher score than one of "
             f"the other method in the same weather, ties counting half. {INTERVALS}"
         )
-        if single:
-            caption += f" {_listed(single)}: a single seed, hence no interval (hollow markers)."
+        if few:
+            caption += f" {_listed(few)}: fewer than {tables.MIN_SEEDS} seeds, hence no interval (hollow markers)."
         parts += [f"{caption} Numbers: `table_statistics.csv`."]
         parts.append(
             self._figure("iqm", figures.plot_scores(self.results, self.reference, self.scores), "IQM by method")
@@ -183,10 +184,10 @@ class Report:
             return []
         figure = figures.plot_progress(self.results, self.reference)
         caption = (
-            "Mean over weathers of the evaluations while training. Line: mean over seeds; band: from the lowest to the "
-            "highest seed (no band for a single one). Number of seeds in brackets: of a method, only the seeds that "
+            f"Mean over weathers of the evaluations while training. Line: mean over seeds; band: `{self.reference}` "
+            "from its lowest to its highest seed. Number of seeds in brackets: of a method, only the seeds that "
             "have come as far as its furthest count. "
-            f"Episodes in each weather: {_episodes_by_step(self.results['evaluations'])}."
+            f"Episodes in each weather: {_episodes_by_step(self.results['evaluations'])}. {_noise(self.results)}"
         )
         return ["## Learning curves", self._figure("learning_curves", figure, "Learning curves"), caption]
 
@@ -211,38 +212,33 @@ class Report:
         return parts
 
     def _failures(self) -> list[str]:
-        table = tables.kept_table(self.results)
+        table = breakdown.failure_table(self.results)
         if table.empty:
             return []
         self._save_table("failures", table)
         parts = ["## When a sensor fails"]
-        episodes = sorted(set(self.results["failures"]["episodes"]))
-        severity = sorted(set(table["severity"]))
         for measure in self.results.measures:
             name = "failures" if measure == RETURN else f"failures_{measure.name}"
-            figure = figures.plot_kept(table, measure)
-            parts += [f"Share of the {measure.name} kept:", tables.kept_markdown(table, measure)]
-            parts.append(self._figure(name, figure, f"Share of the {measure.name} kept under sensor failures"))
+            figure = figures.plot_failures(table, measure)
+            parts += [f"Mean {measure.label}:", breakdown.failure_markdown(table, measure)]
+            parts.append(self._figure(name, figure, f"{measure.name} under sensor failures"))
+            if self.reference in set(table["method"]) and table["method"].nunique() > 1:
+                parts.append(f"Lead of `{self.reference}` in {measure.label}:")
+                parts.append(breakdown.lead_markdown(table, measure, self.reference))
+        if DISTANCE in self.results.measures:
+            parts += ["Share of the mean distance that is kept:", breakdown.kept_markdown(table, DISTANCE)]
+        episodes = sorted(set(self.results["failures"]["episodes"]))
+        severity = sorted(set(table.loc[table["kind"] != "none", "severity"]))
         caption = (
             f"A sensor fails for whole episodes, at severity {_listed(map(str, severity))} (episodes in each weather: "
-            f"{_listed(map(str, episodes))}). Share: mean over the weathers with the failure over that without, in the "
-            "same episodes; bars and table: mean of the seeds' shares; whiskers: from the lowest to the highest seed. "
-            "A share of a poor driver is easily high: read it beside Table 1. "
-            f"The figures' axes end at {figures.KEPT[0]:.0f} and {figures.KEPT[1]:.0f}. Numbers: `table_failures.csv`."
+            f"{_listed(map(str, episodes))}); none: the same episodes with sound sensors. Mean over weathers and seeds "
+            "(number of seeds in brackets), ± standard deviation of the seeds' means (ddof 1); bars: the same means; "
+            "whiskers: from the lowest to the highest seed. A share is the mean with the failure over that without: a "
+            "poor driver easily keeps much. "
         )
-        parts.append(caption)
-        seeds = self.results["failures"].groupby("method")["seed"].nunique()
-        left_out = [
-            f"{row['method']} ({row['modality']} {row['kind']})"
-            for row in table.to_dict("records")
-            if row["return_seeds"] < seeds[row["method"]]
-        ]
-        if left_out:
-            parts.append(
-                "Left out of the share of the return, because a seed's healthy mean is not positive or there is none "
-                f"with the failure: {_listed(left_out)}."
-            )
-        return parts
+        if breakdown.BOTH in set(table["kind"]):
+            caption += "Black = frozen: frozen from the reset on, an event camera shows no events, as a black one. "
+        return [*parts, f"{caption}Numbers: `table_failures.csv`."]
 
     def _provenance(self) -> list[str]:
         return ["## Provenance", *provenance(self.results, self.out)]
@@ -264,6 +260,30 @@ def _episodes_by_step(evaluations: pd.DataFrame) -> str:
     }
     told = [f"{n} at step {s[0]:,}" if len(s) == 1 else f"{n} at steps {s[0]:,} to {s[-1]:,}" for n, s in steps.items()]
     return _listed(told)
+
+
+def _noise(results: Results) -> str:
+    """How much of the curves is chance of the episodes, in a sentence.
+
+    The standard error of a seed's mean over the weathers, from the standard deviations of the final episodes.
+    """
+    episodes = int(results["evaluations"]["episodes"].min())
+    final, weathers = results.finished, len(results.weathers)
+    final = final[final["episodes"] > 1]
+    if final.empty:
+        return "A point of few episodes is noisy: differences between neighbouring points may be chance."
+    told = []
+    for measure in reversed(results.measures):
+        variance = final[f"{measure.name}_std"] ** 2 * final["episodes"] / (final["episodes"] - 1)
+        errors = np.sqrt(variance.groupby([final["method"], final["seed"]]).mean() / (weathers * episodes))
+        told.append(
+            f"±{errors.median():.{measure.digits}f}{f' {measure.unit}' if measure.unit else ''} in {measure.name}"
+        )
+    return (
+        f"A seed's point of {weathers * episodes} episodes has a standard error of {_listed(told)} from the choice of "
+        "the episodes alone (median of the runs, by the spread of their final episodes): differences between points "
+        "that are not well above it say nothing."
+    )
 
 
 def missing(results: Results, table: pd.DataFrame) -> list[str]:
@@ -318,7 +338,8 @@ def _standing(table: pd.DataFrame, measure: Measure, reference: str, weathers: S
 
 def _improvements(scores: pd.DataFrame, measure: Measure, reference: str, when: str = "") -> list[str]:
     """Over which methods the reference is better by more than chance, in sentences."""
-    rows = scores[(scores["measure"] == measure.name) & scores["improvement"].notna()]
+    own = scores[scores["measure"] == measure.name]
+    rows = own[own["improvement"].notna()]
     if rows.empty:
         return []
     unknown = rows["improvement_lower"].isna()
@@ -333,7 +354,14 @@ def _improvements(scores: pd.DataFrame, measure: Measure, reference: str, when: 
         for label, chosen in groups.items()
         if chosen.any()
     ]
-    return [f"Probability that `{reference}` is better in {measure.name}{when}, its 95% interval: {'; '.join(told)}."]
+    text = f"Probability that `{reference}` is better in {measure.name}{when}, its 95% interval"
+    if not unknown.all():
+        seeds = [*own.loc[own["method"] == reference, "seeds"], *rows.loc[~unknown, "seeds"]]
+        counts = str(min(seeds)) if min(seeds) == max(seeds) else f"{min(seeds)} to {max(seeds)}"
+        text += (
+            f" (from {counts} seeds; of three, such intervals hold the truth in about 75% of cases, of eight in 90%)"
+        )
+    return [f"{text}: {'; '.join(told)}."]
 
 
 def _listed(names: Iterable[str]) -> str:

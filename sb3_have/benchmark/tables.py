@@ -9,10 +9,14 @@ import numpy as np
 import pandas as pd
 from numpy.typing import ArrayLike
 
-from sb3_have.benchmark.reading import Measure, Results, ordered
+from sb3_have.benchmark.reading import Measure, Results
 from sb3_have.common.evaluation import Interval, iqm, probability_of_improvement, stratified_bootstrap
 
 ALL = "all"
+
+MIN_SEEDS = 3
+"""Of an interval: one of two seeds would hold the truth in half of all cases, and rule out chance where it is at work
+in one of eight."""
 
 ABLATION = {
     "deepmdp": "one critic of all features (GVE)",
@@ -137,7 +141,7 @@ def ablation_markdown(results: Results, table: pd.DataFrame) -> str:
 
 
 def score_table(results: Results, reference: str = "have", areas: bool = False) -> pd.DataFrame:
-    """Statistics over seeds and weathers with their 95% intervals, NaN where a method has a single seed.
+    """Statistics over seeds and weathers with their 95% intervals, NaN below :data:`MIN_SEEDS` seeds of a method.
 
     :param reference: method whose probability of improvement over each of the others is asked for
     :param areas: of the areas under the learning curves instead of the final evaluations; no rows without evaluations
@@ -162,8 +166,8 @@ def score_table(results: Results, reference: str = "have", areas: bool = False) 
 
 
 def interval(statistic: Callable[..., Any], *scores: ArrayLike) -> Interval:
-    """A statistic with its bootstrap interval, which is NaN where a table has a single run: nothing would vary."""
-    if min(len(np.asarray(table)) for table in scores) < 2:
+    """A statistic with its bootstrap interval, which is NaN where a table has fewer runs than :data:`MIN_SEEDS`."""
+    if min(len(np.asarray(table)) for table in scores) < MIN_SEEDS:
         return Interval(float(statistic(*scores)), np.nan, np.nan)
     return stratified_bootstrap(statistic, *scores, whole_runs=True)
 
@@ -188,58 +192,13 @@ def _with_interval(row: dict[Any, Any], name: str, digits: int) -> str:
     return f"{row[name]:.{digits}f}{bounds}"
 
 
-def kept_table(results: Results) -> pd.DataFrame:
-    """What a method keeps of its return and distance when a sensor fails, over the weathers both were driven in.
-
-    A seed's share is its mean with the failure over its mean without, in the same weathers; it means nothing where the
-    healthy mean is not positive, and such a seed is left out.
-
-    :return: a row for each failure and method: ``method``, ``modality``, ``kind``, ``severity``, and for each measure
-        ``<name>_kept`` (mean over seeds, NaN without one), ``<name>_lowest``, ``<name>_highest`` (of the seeds) and
-        ``<name>_seeds``, how many count
-    """
-    failures = results["failures"]
-    healthy = failures[failures["kind"] == "none"].drop_duplicates(["method", "seed", "weather"])
-    names = [f"{measure.name}_mean" for measure in results.measures]
-    keys = ["method", "seed", "weather"]
-    pairs = failures[failures["kind"] != "none"].merge(healthy[[*keys, *names]], on=keys, suffixes=("", "_healthy"))
-    case = ["method", "modality", "kind", "severity"]
-    of_seeds = pairs.groupby([*case, "seed"], sort=False)[[*names, *(f"{n}_healthy" for n in names)]].mean()
-    rows = []
-    for key, group in of_seeds.groupby(level=case, sort=False):
-        row: dict[str, Any] = dict(zip(case, key, strict=True))
-        for measure in results.measures:
-            before, after = group[f"{measure.name}_mean_healthy"], group[f"{measure.name}_mean"]
-            kept = (after / before.where(before > 0)).dropna()
-            row |= {f"{measure.name}_kept": kept.mean(), f"{measure.name}_lowest": kept.min()}
-            row |= {f"{measure.name}_highest": kept.max(), f"{measure.name}_seeds": len(kept)}
-        rows.append(row)
-    columns = [f"{m.name}_{what}" for m in results.measures for what in ("kept", "lowest", "highest", "seeds")]
-    table = pd.DataFrame(rows, columns=[*case, *columns])
-    rank = {method: place for place, method in enumerate(ordered(set(table["method"])))}
-    return table.sort_values("method", key=lambda names: names.map(rank), kind="stable").reset_index(drop=True)
-
-
-def kept_markdown(table: pd.DataFrame, measure: Measure) -> str:
-    """The shares of :func:`kept_table` for one measure: methods down, failures across."""
-    cases = list(dict.fromkeys(zip(table["modality"], table["kind"], table["severity"], strict=True)))
-    shares = table.set_index(["method", "modality", "kind", "severity"])[f"{measure.name}_kept"]
-    rows = []
-    for method in ordered(set(table["method"])):
-        values = [shares.get((method, *case), np.nan) for case in cases]
-        rows.append([method, *("–" if np.isnan(value) else f"{value:.2f}" for value in values)])
-    severities = {severity for _, _, severity in cases}
-    heads = [f"{m} {kind}" + (f" {severity}" if len(severities) > 1 else "") for m, kind, severity in cases]
-    return markdown(["method", *heads], rows)
-
-
 def run_table(results: Results) -> pd.DataFrame:
     """How far every method is: which seeds are finished, under way, or not begun.
 
     Expected are the runs of the grids; if those are not known, every seed of every method.
 
     :return: a row for each method: ``method``, ``parameters``, ``steps`` (of the finished runs), ``finished``,
-        ``under_way`` (seeds and the step of their newest evaluation), ``not_begun``, ``minutes`` (mean of a run)
+        ``under_way`` (seeds and the step of their newest evaluation), ``not_begun``, ``minutes`` (median of the runs)
     """
     finished, runs, rows = results.finished, results["runs"], []
     every = pd.concat([results["evaluations"], results["final"]])
@@ -258,7 +217,7 @@ def run_table(results: Results) -> pd.DataFrame:
                 "finished": ", ".join(map(str, done)),
                 "under_way": ", ".join(f"{seed} ({state})" for seed, state in under_way.items()),
                 "not_begun": ", ".join(str(s) for s in expected if s not in done and s not in under_way),
-                "minutes": round(of_runs["minutes"].mean(), 1) if len(of_runs) else np.nan,
+                "minutes": round(of_runs["minutes"].median(), 1) if len(of_runs) else np.nan,
             }
         )
     return pd.DataFrame(rows)
@@ -274,7 +233,7 @@ def _newest(rows: pd.DataFrame, weathers: int) -> str:
 def run_markdown(table: pd.DataFrame) -> str:
     """:func:`run_table`."""
     shown = table.assign(minutes=table["minutes"].map(lambda value: "" if np.isnan(value) else f"{value:.0f}"))
-    heads = ["method", "parameters", "steps", "finished seeds", "under way", "not begun", "minutes a run"]
+    heads = ["method", "parameters", "steps", "finished seeds", "under way", "not begun", "minutes a run (median)"]
     return markdown(heads, [[cell or "–" for cell in row] for row in shown.astype(str).to_numpy().tolist()])
 
 

@@ -195,21 +195,19 @@ def checkpoints(folder: str | os.PathLike[str]) -> list[Path]:
 def newest_checkpoint(folder: str | os.PathLike[str]) -> Path | None:
     """The checkpoint with the most steps that can be read, or None; a warning names those that are damaged."""
     for path in reversed(checkpoints(folder)):
-        try:
-            check_archive(path)
-        except DamagedCheckpointError as error:
-            warnings.warn(f"{error}: the one before it is taken, if there is one.", stacklevel=2)
-        else:
+        damage = _damage(path)
+        if damage is None:
             return path
+        warnings.warn(f"{damage}: the one before it is taken, if there is one.", stacklevel=2)
     return None
 
 
-def _is_whole(path: Path) -> bool:
+def _damage(path: Path) -> DamagedCheckpointError | None:
     try:
         check_archive(path)
-    except DamagedCheckpointError:
-        return False
-    return True
+    except DamagedCheckpointError as error:
+        return error
+    return None
 
 
 def _file_of(path: Path) -> Path:
@@ -255,6 +253,10 @@ def write_checkpoint(folder: Path, model: OffPolicyAlgorithm, keep: int, **kwarg
     return True
 
 
+_locks: dict[Path, ExitStack] = {}
+"""Of the folders that this process trains in; it keeps one where a training failed, until it trains there again."""
+
+
 class ResumableCheckpointCallback(BaseCallback):
     """
     Saves checkpoints as a training goes, from which :func:`load_checkpoint` lets it go on exactly.
@@ -264,9 +266,9 @@ class ResumableCheckpointCallback(BaseCallback):
     callback (``EveryNTimesteps``) it would not be told of rollouts, and is refused; so are on-policy algorithms.
 
     :param folder: for ``checkpoint-<step>`` of this training alone: one that has later checkpoints than the training
-        has steps is refused, and so is one in which another process trains
+        has steps is refused, and so is one in which another process trains, or has been interrupted and lives on
     :param save_freq: steps from one to the next, in all environments together as ``num_timesteps``; there is a further
-        one at the end
+        one at the end, but for a training that a callback ends, as its last step is incomplete: a warning says so
     :param keep: how many of the newest stay
     :param verbose: 1 tells of every one
     """
@@ -288,16 +290,24 @@ class ResumableCheckpointCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._last_step = self.model.num_timesteps
-        later = [path for path in checkpoints(self.folder) if checkpoint_step(path) > self._last_step]
-        if any(map(_is_whole, later)):
-            raise ValueError(
-                f"{later[-1]} is later than this training, which has {self._last_step} steps, and load_checkpoint "
-                "would take it: choose another folder, or remove it; to go on from it, use load_checkpoint and "
-                "`learn(..., reset_num_timesteps=False)`"
-            )
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._lock = ExitStack()  # which a training that fails gives back with the callback
-        self._lock.enter_context(locked(self.folder))
+        self._lock = _locks.setdefault(self.folder.resolve(), ExitStack())
+        try:
+            self._lock.enter_context(locked(self.folder))
+        except BlockingIOError as error:
+            raise BlockingIOError(
+                f"{error}; a notebook whose training was interrupted keeps the folder until its kernel is restarted"
+            ) from None
+        later = [path for path in checkpoints(self.folder) if checkpoint_step(path) > self._last_step]
+        newest = next((path for path in reversed(later) if _damage(path) is None), None)
+        if newest is not None:
+            self._lock.close()
+            raise ValueError(
+                f"{newest} is later than this training, which has {self._last_step} steps, and load_checkpoint would "
+                "take it: to train the same model on, `learn(..., reset_num_timesteps=False)`, after "
+                f"`model.num_timesteps = {checkpoint_step(newest)}` where SB3 has just set it to 0; to go on from the "
+                "checkpoint, load_checkpoint and the same; to begin anew, choose another folder, or remove it"
+            )
 
     def _on_rollout_start(self) -> None:
         # The only call of a callback with nothing pending: in `_on_step` the transition is still to be stored, and in
@@ -310,9 +320,14 @@ class ResumableCheckpointCallback(BaseCallback):
         return True
 
     def _on_training_end(self) -> None:
-        # where a callback ended the training, its last transition is in no replay buffer
-        if self.locals.get("new_obs") is self.model._last_obs:
+        if (new_obs := self.locals.get("new_obs")) is self.model._last_obs:
             self._save(rollout_started=False)
+        elif new_obs is not None:
+            warnings.warn(
+                f"A callback ended the training in step {self.model.num_timesteps}, whose transition is in no replay "
+                f"buffer, so that there is no checkpoint of it: the newest in {self.folder} is an earlier one, if any.",
+                stacklevel=2,
+            )
         self._lock.close()
 
     def _save(self, rollout_started: bool) -> None:
