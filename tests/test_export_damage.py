@@ -71,6 +71,18 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
         set_in("observation_space", "spaces", value=[[key, dict(HUGE)] for key in "abc"]),
         r"observation_space is damaged: its spaces have more than",
     ),
+    "negative keys": (
+        set_in("observation_space", "spaces", value=[["a", HUGE | {"shape": [-(10**9)]}], ["b", HUGE], ["c", HUGE]]),
+        r"observation_space is damaged: shape \[-1000000000\], expected whole numbers from 0 on",
+    ),
+    "negative twice": (set_in("action_space", "shape", value=[-2, -1]), r"damaged: shape \(-2, -1\), expected whole"),
+    "fractional": (set_in("action_space", "shape", value=[2.0]), r"damaged: shape \(2.0,\), expected whole numbers"),
+    "nested keys": (
+        set_in(
+            "observation_space", "spaces", value=[["a", {"type": "Dict", "shape": [], "spaces": [["b", HUGE]] * 9}]]
+        ),
+        r"observation_space is damaged: a Dict of something else than Boxes",
+    ),
     **{
         f"huge {name}": (set_in("policy_kwargs", name, value=value), "its parameters are more than twice those of")
         for name, value in {

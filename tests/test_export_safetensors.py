@@ -198,6 +198,26 @@ def test_classes_of_ones_own_are_given(tmp_path: Path) -> None:
         load_policy(tmp_path, "cpu", policy_kwargs={**own, "encoder_classes": {"a": VectorEncoder}})
 
 
+class Lazy(th.nn.Module):
+    """Sizes that a dry run tells."""
+
+    def __init__(self, space: spaces.Box, features_dim: int, **kwargs: Any):
+        super().__init__()
+        self.net = th.nn.Sequential(th.nn.LazyLinear(features_dim), th.nn.Tanh())
+        with th.no_grad():
+            self.net(th.zeros(1, *space.shape))
+
+    def forward(self, values: th.Tensor) -> th.Tensor:
+        return self.net(values)  # type: ignore[no-any-return]
+
+
+def test_lazy_modules_of_ones_own(tmp_path: Path) -> None:
+    kwargs: dict[str, Any] = {"encoder_classes": {"a": Lazy}}
+    model = trained(policy_kwargs=kwargs)
+    export_safetensors(model, tmp_path)
+    assert_same_policy(model, loaded(tmp_path, policy_kwargs=kwargs))
+
+
 def test_policies_of_ones_own_are_given(tmp_path: Path) -> None:
     model = trained()
     model.policy = OwnPolicy(

@@ -10,7 +10,7 @@ import math
 import platform
 import warnings
 from collections import OrderedDict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -27,6 +27,7 @@ from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtr
 from stable_baselines3.sac import policies as sac
 from torch import nn
 from torch.nn.modules.module import register_module_parameter_registration_hook
+from torch.nn.parameter import is_lazy
 
 from sb3_have.common import crossq, encoders, fusion
 from sb3_have.common.buffers import stacked_frames
@@ -197,7 +198,8 @@ def _at_most(size: int) -> Iterator[None]:
 
     def count(module: nn.Module, name: str, parameter: nn.Parameter | None) -> None:
         nonlocal left
-        left -= 0 if parameter is None else parameter.numel() + 1
+        # a lazy one has no shape yet; it is of a class that the caller gave
+        left -= 0 if parameter is None else 1 + (0 if is_lazy(parameter) else parameter.numel())
         if left < 0:
             raise ValueError("its parameters are more than twice those of the weights.")
 
@@ -298,7 +300,7 @@ def space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
 
     :raises ValueError: for other spaces
     """
-    if isinstance(space, spaces.Dict):
+    if isinstance(space, spaces.Dict) and not any(isinstance(item, spaces.Dict) for item in space.values()):
         return {"type": "Dict", "spaces": [[key, space_to_json(item)] for key, item in space.spaces.items()]}
     if not isinstance(space, spaces.Box) or str(space.dtype) not in DTYPES:
         raise ValueError(f"only Box spaces and Dicts of them are exported, got {space}.")
@@ -317,14 +319,16 @@ def space_from_json(value: Any, path: Path, where: str) -> spaces.Space[Any]:
     """
     try:
         if value["type"] == "Dict":
-            if sum(math.prod(item["shape"]) for _, item in value["spaces"]) > MAX_SIZE:
+            if any(item["type"] != "Box" for _, item in value["spaces"]):
+                raise ValueError("a Dict of something else than Boxes")
+            if sum(_size(item["shape"]) for _, item in value["spaces"]) > MAX_SIZE:
                 raise ValueError(f"its spaces have more than {MAX_SIZE} values")
             pairs = [(str(key), space_from_json(item, path, f"{where}[{key!r}]")) for key, item in value["spaces"]]
             return spaces.Dict(OrderedDict(pairs))
         if value["type"] != "Box" or value["dtype"] not in DTYPES:
             raise ValueError(f"type {value['type']!r} of dtype {value.get('dtype')!r}, expected a Box of a NumPy type")
         shape, dtype = tuple(value["shape"]), np.dtype(value["dtype"])
-        if math.prod(shape) > MAX_SIZE:
+        if _size(shape) > MAX_SIZE:
             raise ValueError(f"shape {shape} has more than {MAX_SIZE} values")
         low, high = (np.asarray(from_json(value[name], _ABSENT, path, where, ()), dtype) for name in ("low", "high"))
         return spaces.Box(np.broadcast_to(low, shape), np.broadcast_to(high, shape), shape, dtype.type)
@@ -332,3 +336,12 @@ def space_from_json(value: Any, path: Path, where: str) -> spaces.Space[Any]:
         if str(path) in str(error):
             raise
         raise ValueError(f"{path}: {where} is damaged: {error}; export the policy again.") from error
+
+
+def _size(shape: Sequence[Any]) -> int:
+    """
+    :raises ValueError: if a dimension is not a whole number from 0 on
+    """
+    if not all(type(length) is int and length >= 0 for length in shape):
+        raise ValueError(f"shape {shape}, expected whole numbers from 0 on")
+    return math.prod(shape)
