@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
 
-from sb3_have.benchmark import figures, tables
+from sb3_have.benchmark import breakdown, figures, tables
 from sb3_have.benchmark.reading import DISTANCE, RETURN, Results
 
 
@@ -66,7 +66,8 @@ def test_learning_curves_are_means_of_weathers_with_the_range_of_seeds(results: 
     assert points(line(distance, "have (2)")) == [(1000, 111.25), (2000, 222.5)]
     assert points(line(distance, "sac (2)")) == [(1000, 75), (2000, 150)]
     assert points(line(ret, "have (2)"))[1][1] == pytest.approx(17.25)
-    band = np.asarray(distance.collections[1].get_paths()[0].vertices, float)
+    (bands,) = distance.collections  # of the reference alone
+    band = np.asarray(bands.get_paths()[0].vertices, float)
     assert {(float(x), float(y)) for x, y in band} == {(1000, 85), (1000, 137.5), (2000, 170), (2000, 275)}
     assert to_hex(line(distance, "have (2)").get_color()) == "#000000"
 
@@ -101,10 +102,11 @@ def test_drivers_are_levels_unless_far_above(tmp_path: Path) -> None:
 
 
 def test_intervals_are_drawn_where_they_are(tmp_path: Path) -> None:
-    results = read(tmp_path, final=final({**DISTANCES, "lve": {0: (160, 180)}}))
+    runs = {name: {**seeds, 2: (150, 200)} for name, seeds in DISTANCES.items()}
+    results = read(tmp_path, final=final({**runs, "lve": {0: (160, 180), 1: (160, 180)}}))
     table = tables.score_table(results)
     axis = panel(figures.plot_scores(results, table=table), "IQM of distance")
-    assert [tick.get_text() for tick in axis.get_yticklabels()] == ["sac (2)", "lve (1)", "have (2)"]
+    assert [tick.get_text() for tick in axis.get_yticklabels()] == ["sac (3)", "lve (2)", "have (3)"]
     rows = table[table["measure"] == "distance"].set_index("method")
     bounds = [points(drawn) for drawn in axis.get_lines() if len(points(drawn)) == 2]
     assert bounds == [
@@ -112,7 +114,7 @@ def test_intervals_are_drawn_where_they_are(tmp_path: Path) -> None:
         for name, place in (("sac", 0), ("have", 2))
     ]
     dots = [drawn for drawn in axis.get_lines() if len(points(drawn)) == 1]
-    assert [points(dot)[0] for dot in dots] == [(150, 0), (170, 1), (220, 2)]
+    assert [points(dot)[0] for dot in dots] == [(rows.loc[m, "iqm"], i) for i, m in enumerate(("sac", "lve", "have"))]
     assert [to_hex(dot.get_markerfacecolor()) == "#ffffff" for dot in dots] == [False, True, False]
 
 
@@ -130,6 +132,7 @@ def test_profiles_fall_at_the_scores(results: Results) -> None:
     axis = figures.plot_profiles(results).axes[0]
     drawn = line(axis, "have")
     assert drawn.get_drawstyle() == "steps-post"
+    assert drawn.get_marker() == "o" and line(axis, "sac").get_marker() == "D", "told apart without colours"
     shares = dict(points(drawn))
     assert [shares[x] for x in (0, 140, 150, 190, 200, 250, 300)] == [1, 1, 0.75, 0.5, 0.5, 0.25, 0]
 
@@ -159,31 +162,31 @@ def test_weights_over_an_episode(tmp_path: Path) -> None:
         figures.plot_episode_weights(results, "lve", 3)
 
 
-def test_kept_share_bars(tmp_path: Path) -> None:
+def test_failure_bars(tmp_path: Path) -> None:
     rows = failure_rows({"have": {0: (100.0, 60.0), 1: (200.0, 110.0)}, "sac": {0: (60.0, 150.0)}})
     rows += [row for row in failure_rows({"sac": {0: (60.0, 45.0)}}, "event") if row["kind"] == "black"]
-    table = tables.kept_table(read(tmp_path, final=final(), failures=rows))
-    figure = figures.plot_kept(table, RETURN)
+    table = breakdown.failure_table(read(tmp_path, final=final(), failures=rows))
+    figure = figures.plot_failures(table, RETURN)
     rgb, event = panel(figure, "rgb fails"), panel(figure, "event fails")
-    assert bars(rgb) == {"#888888": [pytest.approx(10)], "#000000": [pytest.approx(0.3)]}
-    assert bars(event) == {"#888888": [pytest.approx(-0.5)]}
-    np.testing.assert_allclose(whiskers(rgb), [[0.2, 0.4]])
-    assert rgb.get_ylim()[1] == figures.KEPT[1] and -1 <= rgb.get_ylim()[0] < -0.5
-    assert [tick.get_text() for tick in rgb.get_xticklabels()] == ["black"]
+    assert bars(rgb) == {"#888888": [1, 10], "#000000": [10, 3.5]}
+    assert bars(event) == {"#888888": [1, -0.5]}, "have was not driven so"
+    np.testing.assert_allclose(whiskers(rgb), [[5, 15], [1, 6]])
+    assert [tick.get_text() for tick in rgb.get_xticklabels()] == ["none", "rgb black"]
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["sac", "have"]
 
 
-def test_kept_share_bars_stand_over_their_kind(tmp_path: Path) -> None:
-    black = failure_rows({"have": {0: (100.0, 60.0)}, "drq": {0: (100.0, 70.0)}})
+def test_failure_bars_stand_over_their_kind(tmp_path: Path) -> None:
+    black = failure_rows({"have": {0: (100.0, 60.0)}, "sac": {0: (100.0, 70.0)}})
     noise = [row | moments(row["distance_mean"] - 30, 1) | {"kind": "noise"} for row in black if row["kind"] == "black"]
-    table = tables.kept_table(read(tmp_path, final=final(), failures=[*black, *noise]))
-    (axis,) = figures.plot_kept(table, DISTANCE).axes
-    assert [tick.get_text() for tick in axis.get_xticklabels()] == ["black", "noise"]
-    drq, have = (group.patches for group in axis.containers if isinstance(group, BarContainer))
-    drawn = [(bar.get_x() + bar.get_width() / 2, bar.get_y(), bar.get_height()) for bar in [*drq, *have]]
-    np.testing.assert_allclose(drawn, [(-0.21, 0, 0.7), (0.79, 0, 0.4), (0.21, 0, 0.6), (1.21, 0, 0.3)])
-    assert drq[0].get_hatch() and not have[0].get_hatch()
+    table = breakdown.failure_table(read(tmp_path, final=final(), failures=[*black, *noise]))
+    (axis,) = figures.plot_failures(table, DISTANCE).axes
+    assert [tick.get_text() for tick in axis.get_xticklabels()] == ["none", "rgb black", "rgb noise"]
+    sac, have = (group.patches for group in axis.containers if isinstance(group, BarContainer))
+    drawn = [(bar.get_x() + bar.get_width() / 2, bar.get_y(), bar.get_height()) for bar in [*sac, *have]]
+    expected = [(-0.21, 0, 100), (0.79, 0, 70), (1.79, 0, 40), (0.21, 0, 100), (1.21, 0, 60), (2.21, 0, 30)]
+    np.testing.assert_allclose(drawn, expected)
+    assert sac[0].get_hatch() and not have[0].get_hatch()
 
 
 def test_methods_look_different_and_always_the_same() -> None:
@@ -192,6 +195,8 @@ def test_methods_look_different_and_always_the_same() -> None:
     for other, style in figures.STYLES.items():
         alike = [name for name, look in figures.STYLES.items() if look[:2] == style[:2] and name != other]
         assert not alike, f"{other} is told from {alike} by its marker only"
+    core = [figures.STYLES[name] for name in ("rgb", "event", "sac", "deepmdp", "gve-wide", "lve")]
+    assert len({style.marker for style in core}) == len({style.hatch for style in core}) == len(core), "without colour"
     assert figures.style("my-method") == figures.style("my-method") != figures.style("have")
 
 

@@ -130,7 +130,7 @@ def test_report_and_all_that_it_shows(tmp_path: Path, capsys: pytest.CaptureFixt
     for name in re.findall(r"`(table_\w+\.csv)`", report):
         assert len(pd.read_csv(out / name))
     assert "`have` is first in distance in 2 of 2 weathers." in report
-    assert "is better in distance while training, its 95% interval: including 0.5 for `sac`" in report
+    assert "is better in distance while training, its 95% interval: not known for want of seeds for `sac`" in report
     assert "at steps 1,000 and 2,000. It tells who learns sooner." in report
     assert "best first: `have` 222 m, `sac` 150 m." in report
     assert "| have   | 4        | 0.75    | 0.00          | 30         |" in report
@@ -156,11 +156,23 @@ def test_same_results_same_bytes(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("words_only")
 def test_intervals_in_words(tmp_path: Path) -> None:
-    seeds = {"have": (30, 50), "rgb": (10, 20), "sac": (40, 41), "lve": (60, 70)}
-    runs: Runs = {name: {0: (a, a), 1: (b, b)} for name, (a, b) in seeds.items()}
-    report = write_report(write(tmp_path / "a", final=final({**runs, "drq": {0: (1, 1)}}))).read_text()
+    seeds = {"have": (30, 50, 40), "rgb": (10, 20, 15, 16), "sac": (40, 41, 42), "lve": (60, 70, 65), "drq": (1, 1)}
+    runs: Runs = {name: {i: (a, a) for i, a in enumerate(scores)} for name, scores in seeds.items()}
+    report = write_report(write(tmp_path / "a", final=final(runs))).read_text()
     told = "above 0.5 for `rgb`; including 0.5 for `sac`; below 0.5 for `lve`; not known for want of seeds for `drq`"
-    assert f"Probability that `have` is better in distance, its 95% interval: {told}." in report
+    few = "from 3 to 4 seeds; of three, such intervals hold the truth in about 75% of cases, of eight in 90%"
+    assert f"Probability that `have` is better in distance, its 95% interval ({few}): {told}." in report
+
+
+@pytest.mark.usefixtures("words_only")
+def test_noise_of_the_learning_curves_in_words(tmp_path: Path) -> None:
+    """Two weathers with two final episodes each, of standard deviation 30 m (ddof 0) as ever here."""
+    one_each = [row | {"episodes": 1} for row in evaluations(shares={1000: 0.5})]
+    report = write_report(write(tmp_path / "a", final=final(), evaluations=one_each)).read_text()
+    assert "A seed's point of 2 episodes has a standard error of ±30 m in distance and ±3.0 in return" in report
+    single = [row | {"episodes": 1} for row in final()]
+    report = write_report(write(tmp_path / "b", final=single, evaluations=one_each)).read_text()
+    assert "A point of few episodes is noisy" in report
 
 
 def test_settings_by_dotted_names() -> None:

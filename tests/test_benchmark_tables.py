@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 import pytest
 from benchmark_results import (
-    DISTANCES,
     NIGHT,
     NOON,
     STD,
@@ -24,7 +23,7 @@ from benchmark_results import (
 )
 from matplotlib.figure import Figure
 
-from sb3_have.benchmark import tables
+from sb3_have.benchmark import breakdown, tables
 from sb3_have.benchmark.reading import DISTANCE, RETURN, Results
 from sb3_have.benchmark.report import write_report
 
@@ -140,10 +139,6 @@ def test_statistics_by_hand(results: Results) -> None:
     assert have["iqm"] == 220 and sac["iqm"] == 150
     # at noon 4 of 4 pairs, at night 3 of 4
     assert sac["improvement"] == 7 / 8 and np.isnan(have["improvement"])
-    assert 0.5 <= sac["improvement_lower"] < 7 / 8 < sac["improvement_upper"] == 1
-    # seeds are drawn whole: have's are 170 and 275 on average, sac's both 150
-    assert (have["iqm_lower"], have["iqm_upper"]) == (170, 275)
-    assert sac["iqm_lower"] == sac["iqm_upper"] == 150
 
 
 def test_areas_by_hand(tmp_path: Path) -> None:
@@ -159,42 +154,81 @@ def test_areas_by_hand(tmp_path: Path) -> None:
     assert tables.score_table(read(tmp_path / "none", final=final()), areas=True).empty
 
 
+def test_intervals_draw_whole_seeds(tmp_path: Path) -> None:
+    """With single scores drawn, no interval of have's would reach from one seed's mean to another's."""
+    runs = {"sac": {0: (100, 200), 1: (140, 160), 2: (150, 150)}, "have": {i: (200 + i, 400 + i) for i in range(3)}}
+    sac, have = tables.score_table(read(tmp_path, final=final(runs))).tail(2).to_dict("records")
+    assert (have["iqm_lower"], have["iqm_upper"]) == (300, 302)
+    assert sac["iqm_lower"] == sac["iqm_upper"] == 150
+    assert (sac["improvement_lower"], sac["improvement_upper"]) == (1, 1)
+
+
 @pytest.mark.usefixtures("words_only")
-def test_no_interval_from_a_single_seed(tmp_path: Path) -> None:
-    runs = {**DISTANCES, "lve": {0: (160, 180)}}
+@pytest.mark.parametrize("seeds", [1, 2])
+def test_no_interval_from_so_few_seeds(tmp_path: Path, seeds: int) -> None:
+    runs = {name: dict.fromkeys(range(3), (100, 200)) for name in ("sac", "have")}
+    runs["lve"] = dict.fromkeys(range(seeds), (160, 180))
     results = read(tmp_path, final=final(runs))
     table = tables.score_table(results)
     lve = table[(table["method"] == "lve") & (table["measure"] == "distance")].iloc[0]
-    assert lve["iqm"] == 170 and lve["improvement"] == 0.75
+    assert lve["iqm"] == 170 and lve["improvement"] == 0.5
     assert lve[["iqm_lower", "iqm_upper", "improvement_lower", "improvement_upper"]].isna().all()
     assert np.isfinite(table.loc[table["method"] != "lve", "iqm_lower"]).all()
     text = tables.score_markdown(table, DISTANCE, "have").splitlines()
-    assert [part.strip() for part in text[3].split("|")[1:-1]] == ["lve", "1", "170", "0.75"]
+    assert [part.strip() for part in text[3].split("|")[1:-1]] == ["lve", str(seeds), "170", "0.50"]
     report = write_report(tmp_path, tmp_path / "out").read_text()
-    assert "lve: a single seed, hence no interval" in report and "not known for want of seeds for `lve`" in report
+    assert "lve: fewer than 3 seeds, hence no interval" in report and "not known for want of seeds for `lve`" in report
+
+
+def test_minutes_are_those_of_an_ordinary_run(tmp_path: Path) -> None:
+    """A single run on a busy machine tells nothing of the others."""
+    runs = {"have": dict.fromkeys(range(3), (100, 200))}
+    rows = [row | {"minutes": minutes} for row, minutes in zip(run_rows(runs), (15.0, 13.0, 130.0), strict=True)]
+    (row,) = tables.run_table(read(tmp_path, final=final(runs), runs=rows)).to_dict("records")
+    assert row["minutes"] == 15
+
+
+def named(table: pd.DataFrame) -> dict[tuple[str, str], dict[str, Any]]:
+    """Rows by method, and modality and kind."""
+    rows = table.to_dict("records")
+    return {(row["method"], f"{row['modality']} {row['kind']}"): {str(k): v for k, v in row.items()} for row in rows}
 
 
 @pytest.mark.usefixtures("words_only")
-def test_kept_share_by_hand(tmp_path: Path) -> None:
-    # returns 5 -> 1 and 15 -> 6; the healthy return of lve's seed 1 is negative
-    kept = {"have": {0: (100.0, 60.0), 1: (200.0, 110.0)}, "lve": {0: (100.0, 60.0), 1: (40.0, 20.0)}}
-    results = read(tmp_path, final=final(), failures=failure_rows(kept))
-    lve, have = tables.kept_table(results).to_dict("records")
-    assert (lve["method"], have["method"], have["modality"], have["kind"]) == ("lve", "have", "rgb", "black")
-    assert have["return_kept"] == pytest.approx((0.2 + 0.4) / 2)
-    assert (have["return_lowest"], have["return_highest"]) == pytest.approx((0.2, 0.4))
-    assert have["distance_kept"] == pytest.approx((0.6 + 0.55) / 2)
-    assert (lve["return_kept"], lve["return_seeds"]) == (pytest.approx(0.2), 1)
-    assert (lve["distance_kept"], lve["distance_seeds"]) == (pytest.approx((0.6 + 0.5) / 2), 2)
+def test_failures_by_hand(tmp_path: Path) -> None:
+    # returns 5 -> 1 and 15 -> 6; lve's 5 -> 1 and -1 -> -3
+    given = {"have": {0: (100.0, 60.0), 1: (200.0, 110.0)}, "lve": {0: (100.0, 60.0), 1: (40.0, 20.0)}}
+    results = read(tmp_path, final=final(), failures=failure_rows(given))
+    table = breakdown.failure_table(results)
+    assert list(named(table)) == [(m, case) for m in ("lve", "have") for case in ("none none", "rgb black")]
+    sound, have, lve = (named(table)[k] for k in (("have", "none none"), ("have", "rgb black"), ("lve", "rgb black")))
+    assert (sound["return_mean"], sound["distance_mean"], sound["distance_kept"], sound["seeds"]) == (10, 150, 1, 2)
+    assert (have["return_mean"], have["return_lowest"], have["return_highest"]) == pytest.approx((3.5, 1, 6))
+    assert have["distance_mean"] == 85 and have["distance_std"] == pytest.approx(50 / 2**0.5)
+    # of the means, not the mean of 0.6 and 0.55, or of the returns 0.2 and 3
+    assert have["distance_kept"] == pytest.approx(85 / 150)
+    assert (lve["return_mean"], lve["return_kept"]) == pytest.approx((-1, -0.5))
     report = write_report(tmp_path, tmp_path / "out").read_text()
-    assert "there is none with the failure: lve (rgb black)." in report
+    assert "| have (2) | 10.0 ± 7.1 | 3.5 ± 3.5  |" in report and "| have (2) | 150 ± 71 | 85 ± 35   |" in report
+    assert "| over lve | +8.0 | +4.5      |" in report and "| over lve | +80  | +45       |" in report
+    assert "| have   | 0.57      |" in report and "Black = frozen" not in report
 
 
-def test_kept_share_is_of_the_same_weathers(tmp_path: Path) -> None:
-    rows = failure_rows({"have": {0: (100.0, 60.0)}})
-    rows.append({**rows[0], "weather": NOON, **moments(1000, 1)})  # healthy only
-    (have,) = tables.kept_table(read(tmp_path, final=final(), failures=rows)).to_dict("records")
-    assert have["distance_kept"] == pytest.approx(0.6)
+@pytest.mark.usefixtures("words_only")
+def test_frozen_that_is_black_counts_once(tmp_path: Path) -> None:
+    rows = failure_rows({"have": {0: (100.0, 60.0)}, "sac": {0: (90.0, 50.0)}}, "event")
+    rows += [row for row in failure_rows({"have": {0: (100.0, 70.0)}}) if row["kind"] == "black"]
+    rows += [row | {"kind": "frozen"} for row in rows if row["kind"] == "black"]
+    rows[-1] |= moments(75, 1)  # of rgb
+    results = read(tmp_path, final=final(), failures=rows)
+    table = breakdown.failure_table(results)
+    assert [case for method, case in named(table) if method == "have"] == [
+        *("none none", "event black = frozen", "rgb black", "rgb frozen"),
+    ]
+    assert named(table)["sac", "event black = frozen"]["distance_mean"] == 50
+    report = write_report(tmp_path, tmp_path / "out").read_text()
+    assert "Black = frozen: frozen from the reset on, an event camera shows no events" in report
+    assert "| sac (1)  | 90   | 50                   | –         | –          |" in report
 
 
 def test_markdown_escapes_and_lines_up() -> None:
