@@ -154,7 +154,12 @@ def test_refusion_that_does_not_learn(fault: str, in_optimizer: bool) -> None:
 def test_faults_go_again_and_leave_other_forms_alone(fault: str) -> None:
     def methods() -> list[Any]:
         owned = [(HAVESAC, "_target_values"), (HAVESAC, "_critic_loss"), (HAVESAC, "train")]
-        owned += [(MultiModalPolicy, "encode"), (MultiModalPolicy, "_build"), (MultiModalCritic, "values")]  # type: ignore[list-item]
+        owned += [
+            (MultiModalPolicy, "encode"),
+            (MultiModalPolicy, "_build"),
+            (MultiModalCritic, "values"),
+            (MultiModalCritic, "min_q"),
+        ]  # type: ignore[list-item]
         return [getattr(owner, name) for owner, name in owned]
 
     sound = methods()
@@ -178,6 +183,27 @@ def test_the_worst_seed_counts(values: list[float], worst: float, ok: bool, monk
     monkeypatch.setitem(study_quick.SUITES, "driving", (Bound("bias", -0.2, 0.2, ""),))
     (verdict,) = judge("driving", [{"bias": value} for value in values])
     assert verdict.worst == pytest.approx(worst, nan_ok=True) and verdict.ok is ok
+
+
+def test_the_mean_return_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """One seed may be below the return of doing nothing; a driver that does nothing fails."""
+
+    def verdict(*returns: float) -> Verdict:
+        drives = [{"final_return": value, "weight_auc": 1.0, "negative_gradient": 0.0} for value in returns]
+        return judge("driving", drives)[0]
+
+    assert verdict(58.0, 72.0).ok and verdict(58.0, 72.0).worst == 65
+    assert not verdict(59.4, 59.4).ok and not verdict(99.0, math.nan).ok
+    assert "final_return (mean)" in describe([verdict(58.0, 72.0)])
+
+
+def test_actor_that_descends(model: HAVESAC, features: th.Tensor) -> None:
+    """The target is what it was, and the actor's step goes the other way."""
+    given, actions = arguments(features), th.zeros(len(features), 2)
+    sound = target(model, given), model.critic.min_q(features, actions)
+    with FAULTS["reversed_actor"]():
+        assert th.equal(target(model, given), sound[0])
+        assert th.equal(model.critic.min_q(features, actions), -sound[1])
 
 
 def test_bounds_fit_what_is_measured() -> None:
