@@ -18,6 +18,7 @@ from stable_baselines3.common.callbacks import (
     BaseCallback,
     CallbackList,
     EvalCallback,
+    EveryNTimesteps,
     StopTrainingOnNoModelImprovement,
 )
 from stable_baselines3.common.monitor import Monitor
@@ -241,6 +242,15 @@ def test_state_of_callbacks(tmp_path: Path) -> None:
     assert evaluation.n_calls == 10 and evaluation.best_mean_reward == first[1].best_mean_reward > -np.inf
     assert isinstance(evaluation.callback, StopTrainingOnNoModelImprovement)
     assert evaluation.callback.n_calls == 2 and evaluation.callback.last_best_mean_reward > -np.inf
+
+
+def test_callbacks_stay_where_they_are(tmp_path: Path) -> None:
+    """One that was saved alone may be within another when the training goes on."""
+    model = sac(make_vec_env())
+    save_checkpoint(model, tmp_path / "mine", Counting(1.0))
+    within = EveryNTimesteps(2, Counting(1.0))
+    load_checkpoint(tmp_path / "mine", make_vec_env(), within, device="cpu")
+    assert within.callback is not None and within.callback.parent is within
 
 
 class Stateful(BaseCallback):

@@ -49,7 +49,11 @@ def _callback_state(callback: BaseCallback) -> Any:
         return callback.get_state()  # type: ignore[attr-defined]
     # what the constructor takes is the user's, who may give something else when the training goes on
     constructors = [vars(each)["__init__"] for each in type(callback).__mro__ if "__init__" in vars(each)]
-    given = {name for each in constructors for name in inspect.signature(each).parameters} | {"locals", "globals"}
+    given = {name for each in constructors for name in inspect.signature(each).parameters} | {
+        "locals",
+        "globals",
+        "parent",
+    }
     return {name: value for name, value in vars(callback).items() if name not in given and _is_plain(value)}
 
 
