@@ -28,6 +28,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_have.common.archive import DamagedCheckpointError
 from sb3_have.common.checkpoint import checkpoint_info, checkpoints
 from sb3_have.common.recording import Recording, record_episode
+from sb3_have.common.saved_algorithm import saved_algorithm
 from sb3_have.common.wrapping import saved_normalizer
 from sb3_have.configuration import env_wrapper, hyperparameter, load_config
 from sb3_have.envs.vision import MODALITIES
@@ -37,14 +38,6 @@ from sb3_have.train import algorithms
 ENV_ID = "HighwayVision-v0"
 CAMERAS = (ENV_ID, "CarlaVision-v0")
 """Environments with the keywords ``modalities`` and ``image_size``."""
-SAVED_BY = {
-    "sb3_have.have": "havesac",
-    "stable_baselines3.sac": "sac",
-    "sb3_contrib.tqc": "tqc",
-    "sb3_contrib.crossq": "crossq",
-    "sb3_have.common.crossq": "crossq",
-}
-"""Algorithm by the module of the policy's class."""
 
 
 def model_file(path: Path) -> Path:
@@ -88,22 +81,6 @@ def read_model(file: Path) -> tuple[io.BytesIO, dict[str, Any]]:
         with suppress(DamagedCheckpointError):
             return io.BytesIO(file.read_bytes()), dict(checkpoint_info(checkpoint)["info"].get("settings", {}))
     return io.BytesIO(file.read_bytes()), {}
-
-
-def saved_algorithm(model: io.BytesIO, name: Path | str = "the file") -> str | None:
-    """Name of the algorithm that saved a model, None if it is not known here; nothing is unpickled to tell.
-
-    :param model: the model's zip
-    :param name: of its file, for the error
-    :raises ValueError: if it is no model that SB3 saved
-    """
-    try:
-        with zipfile.ZipFile(model) as archive:
-            policy: Mapping[str, Any] = json.loads(archive.read("data"))["policy_class"]
-    except (zipfile.BadZipFile, KeyError, ValueError) as error:
-        raise ValueError(f"{name} is not a model that SB3's save() wrote, or it is damaged: {error}") from error
-    module = str(policy.get("__module__", ""))
-    return next((algo for prefix, algo in SAVED_BY.items() if module.startswith(prefix)), None)
 
 
 def load_model(file: Path, algo: str | None = None, device: str = "auto") -> tuple[BaseAlgorithm, dict[str, Any]]:

@@ -58,10 +58,10 @@ def test_wrong_files(tmp_path: Path, zipped: Path) -> None:
     assert "nothing.zip: no such file, nor a folder with config.json" in run(tmp_path / "nothing.zip", *to_onnx)
     assert f"{tmp_path}: no such file, nor a folder" in run(tmp_path, *to_onnx)
     (tmp_path / "text").write_text("text")
-    assert "text: not a model that SB3 saved by `model.save(path)`" in run(tmp_path / "text", *to_onnx)
+    assert "text is not a model that SB3 saved by `model.save(path)`" in run(tmp_path / "text", *to_onnx)
     with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
         archive.writestr("policy.pth", b"")
-    assert "other.zip: not a model that SB3 saved" in run(tmp_path / "other.zip", *to_onnx)
+    assert "other.zip is not a model that SB3 saved" in run(tmp_path / "other.zip", *to_onnx)
     PPO("MlpPolicy", RandomSensors(vector(3)), device="cpu").save(tmp_path / "ppo.zip")
     assert "ppo.zip: its policy is of stable_baselines3.common.policies, and only" in run(
         tmp_path / "ppo.zip", *to_onnx

@@ -16,11 +16,13 @@ from fake_drive import CONFIG, ENV_ID
 from gymnasium import spaces
 from PIL import Image
 from stable_baselines3 import PPO, SAC
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
 
 from sb3_have import HAVESAC, train, watch
 from sb3_have.common.checkpoint import save_checkpoint
 from sb3_have.common.recording import Recording, record_episode
+from sb3_have.common.saved_algorithm import saved_algorithm
+from sb3_have.common.wrapping import saved_normalizer, wrap_as_trained
 from sb3_have.plotting import Frames, animation, write_animation
 from sb3_have.plotting.style import modality_colours
 
@@ -202,13 +204,15 @@ def test_the_algorithm_is_told_by_the_file(tmp_path: Path) -> None:
     SAC("MultiInputPolicy", env, buffer_size=10).save(tmp_path / "sac.zip")
     tiny_model(vectors_space()).save(tmp_path / "have.zip")
     PPO("MultiInputPolicy", env, n_steps=8, batch_size=8).save(tmp_path / "ppo.zip")
-    for name, algo in (("sac", "sac"), ("have", "havesac"), ("ppo", None)):
-        assert watch.saved_algorithm(watch.read_model(tmp_path / f"{name}.zip")[0]) == algo
+    for name, algo in (("sac", "sac"), ("have", "havesac")):
+        assert saved_algorithm(tmp_path / f"{name}.zip", name) == algo
     model, settings = watch.load_model(tmp_path / "have.zip", device="cpu")
     assert isinstance(model, HAVESAC) and settings == {}
     with pytest.raises(ValueError, match="saved by sac, not by havesac"):
         watch.load_model(tmp_path / "sac.zip", "havesac")
-    with pytest.raises(ValueError, match="cannot be loaded as havesac"):
+    with pytest.raises(
+        ValueError, match=r"ppo\.zip: its policy is of .*, and only those of crossq, havesac, sac, tqc are"
+    ):
         watch.load_model(tmp_path / "ppo.zip", device="cpu")
 
 
@@ -254,6 +258,31 @@ def test_a_checkpoint_and_a_model_beside_it_tell_the_same(run: Path, tmp_path: P
     assert watch.model_file(running) == running / "checkpoint-20"
     with pytest.raises(FileNotFoundError, match=r"model\.zip and .*checkpoint-<step>"):
         watch.model_file(tmp_path)
+
+
+class Clipped(VecNormalize):
+    """A subclass, which is called otherwise."""
+
+
+def test_statistics_of_a_subclass_and_at_another_place(tmp_path: Path) -> None:
+    def saved(env: VecEnv) -> tuple[Any, VecNormalize | None]:
+        model = tiny_model(vectors_space(), env=env)
+        env.reset()
+        save_checkpoint(model, tmp_path / "checkpoint")
+        model.env = model._vec_normalize_env = None
+        return model, saved_normalizer(tmp_path / "checkpoint")
+
+    def make() -> VecEnv:
+        return DummyVecEnv([lambda: gym.make(VECTORS)])
+
+    env = Clipped(make())
+    model, found = saved(env)
+    assert found is not None and env.obs_rms["a"].mean.any()
+    np.testing.assert_array_equal(found.obs_rms["a"].mean, env.obs_rms["a"].mean)
+    assert wrap_as_trained(make(), model, found).observation_space == model.observation_space
+    model, found = saved(VecFrameStack(VecNormalize(make()), 2))
+    with pytest.raises(ValueError, match=r"shapes {'a': \(2,\), .*{'a': \(4,\), .*within VecFrameStack"):
+        wrap_as_trained(make(), model, found)
 
 
 def test_statistics_of_the_training_are_found(

@@ -31,8 +31,9 @@ def wrap_as_trained(vec_env: VecEnv, model: Any, normalizer: VecNormalize | None
         order; without one, see :func:`~sb3_have.common.episodes.match_observations`
     :param normalizer: of the training of a model without its environment; see :func:`saved_normalizer`
     :return: rewards are not normalised
-    :raises ValueError: if the result has not the observation space of the model, or another wrapper of the training
-        changed the observations
+    :raises ValueError: if the result has not the observation space of the model, another wrapper of the training
+        changed the observations, or the normalizer's statistics are of other shapes, as those of one within
+        ``VecFrameStack`` are
     """
     trained: VecEnv | None = getattr(model, "get_env", lambda: None)()
     if trained is None:
@@ -55,7 +56,8 @@ def wrap_as_trained(vec_env: VecEnv, model: Any, normalizer: VecNormalize | None
 def saved_normalizer(file: Path) -> VecNormalize | None:
     """The ``VecNormalize`` that a model was trained under, without its environment.
 
-    :param file: a checkpoint, or what ``VecNormalize.save`` wrote; it is unpickled
+    :param file: a checkpoint, or what ``VecNormalize.save`` wrote; it is unpickled. Of a subclass, a checkpoint gives
+        the statistics as VecNormalize
     :return: None if a checkpoint has none
     :raises ValueError: if something else is pickled in the file
     """
@@ -66,12 +68,12 @@ def saved_normalizer(file: Path) -> VecNormalize | None:
             raise ValueError(f"{file} holds a {type(saved).__name__}, not a VecNormalize")
         return saved
     with zipfile.ZipFile(file) as archive:
-        if VecNormalize.__name__.encode() not in archive.read("state.pkl"):
+        if b"norm_obs" not in archive.read("state.pkl"):
             return None  # which spares us the replay buffer
     layers = read_archive(file)[2]["environments"].layers
     states, *_ = loads(layers.pickled, [_Absent()] * len(layers.names))
-    for name, state in zip(layers.names, states, strict=True):
-        if name == VecNormalize.__name__:
+    for state in states:
+        if state.keys() >= {"norm_obs", "clip_obs", "ret_rms"}:  # subclasses have other names
             normalizer = VecNormalize.__new__(VecNormalize)
             vars(normalizer).update(state)
             return normalizer
@@ -99,6 +101,12 @@ def _same_layer(layer: VecEnvWrapper, vec_env: VecEnv) -> VecEnv:
         options = {name: getattr(layer, name) for name in ("norm_obs", "norm_obs_keys", "clip_obs", "epsilon")}
         normalized = VecNormalize(vec_env, training=False, norm_reward=False, **options)
         if layer.norm_obs:
+            if (found := _shapes(layer)) != (expected := _shapes(normalized)):
+                raise ValueError(
+                    f"the statistics of VecNormalize have the shapes {found}, and the observations that the model "
+                    f"reads {expected}: in training it stood elsewhere among the wrappers (within VecFrameStack or "
+                    "VecTransposeImage), or was another one; load the model with its environment"
+                )
             normalized.obs_rms = deepcopy(layer.obs_rms)
         return normalized
     if layer.observation_space != layer.venv.observation_space:
@@ -107,6 +115,12 @@ def _same_layer(layer: VecEnvWrapper, vec_env: VecEnv) -> VecEnv:
             "do the same by a gymnasium wrapper on the environment"
         )
     return vec_env
+
+
+def _shapes(normalizer: VecNormalize) -> dict[str, tuple[int, ...]]:
+    statistics: Any = normalizer.obs_rms
+    parts = statistics if isinstance(statistics, dict) else {"observation": statistics}
+    return {key: part.mean.shape for key, part in parts.items()}
 
 
 def _order(stacked: StackedObservations[Any]) -> str:

@@ -11,27 +11,17 @@ unpickles the file and so executes what that holds, so give only one that you tr
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-import zipfile
 from pathlib import Path
 
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_have.common.saved_algorithm import saved_algorithm
 from sb3_have.export.config import NORMALIZED
 from sb3_have.export.onnx import export_onnx
 from sb3_have.export.safetensors import CONFIG_FILE, export_safetensors, load_policy, read_config
 from sb3_have.train import algorithms
-
-MODULES = {
-    "sb3_have.have": "havesac",
-    "sb3_have.common.crossq": "crossq",
-    "sb3_contrib.crossq": "crossq",
-    "sb3_contrib.tqc": "tqc",
-    "stable_baselines3.sac": "sac",
-}
-"""Algorithms by the module of their policies; a policy of a user's is taken for a subclass of HAVESAC's."""
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -72,24 +62,13 @@ def load_zip(path: Path, algo: str | None = None) -> BaseAlgorithm:
     A model saved by SB3, on the CPU. This unpickles the file: it executes what that holds.
 
     :param path: of the zip
-    :param algo: name of the algorithm; by default it is found out from the policy
+    :param algo: name of the algorithm; by default that of the policy, and HAVESAC for a policy of a user's own
     :raises FileNotFoundError: if there is no such file
     :raises ValueError: if it is something else
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: no such file, nor a folder with {CONFIG_FILE}")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            data = json.loads(archive.read("data"))
-            module = str(data["policy_class"]["__module__"])
-    except (zipfile.BadZipFile, KeyError, TypeError, ValueError) as error:
-        raise ValueError(
-            f"{path}: not a model that SB3 saved by `model.save(path)` ({error}); a checkpoint's folder has one in "
-            "its model.zip"
-        ) from error
-    found = next((name for prefix, name in MODULES.items() if module.startswith(prefix)), None)
-    if found is None and module.startswith(("stable_baselines3.", "sb3_contrib.")):
-        raise ValueError(f"{path}: its policy is of {module}, and only {', '.join(algorithms())} can be exported")
+    found = saved_algorithm(path, path)
     if algo is not None and found not in (None, algo):
         raise ValueError(f"{path}: its policy is of {found}, not of {algo}: leave out --algo")
     try:
