@@ -153,13 +153,9 @@ def test_refusion_that_does_not_learn(fault: str, in_optimizer: bool) -> None:
 @pytest.mark.parametrize("fault", FAULTS)
 def test_faults_go_again_and_leave_other_forms_alone(fault: str) -> None:
     def methods() -> list[Any]:
-        owned = [(HAVESAC, "_target_values"), (HAVESAC, "_critic_loss"), (HAVESAC, "train")]
-        owned += [
-            (MultiModalPolicy, "encode"),
-            (MultiModalPolicy, "_build"),
-            (MultiModalCritic, "values"),
-            (MultiModalCritic, "min_q"),
-        ]  # type: ignore[list-item]
+        owned: list[tuple[Any, str]] = [(HAVESAC, name) for name in ("_target_values", "_critic_loss", "train")]
+        owned += [(MultiModalPolicy, "encode"), (MultiModalPolicy, "_build")]
+        owned += [(MultiModalCritic, "values"), (MultiModalCritic, "min_q")]
         return [getattr(owner, name) for owner, name in owned]
 
     sound = methods()

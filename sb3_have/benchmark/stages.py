@@ -145,10 +145,9 @@ def n_parameters(model: OffPolicyAlgorithm) -> int:
     """
     left_out = ["critic_target."]
     if isinstance(model, HAVESAC):
-        heads = model.policy.auxiliary.items()
-        left_out += [
-            f"auxiliary.{name}." for name, head in heads if model.auxiliary_coefs.keys().isdisjoint(head.terms)
-        ]
+        heads: dict[str, Any] = dict(model.policy.auxiliary.items())
+        trained = model.auxiliary_coefs.keys()
+        left_out += [f"auxiliary.{name}." for name, head in heads.items() if trained.isdisjoint(head.terms)]
     return sum(
         parameter.numel()
         for name, parameter in model.policy.named_parameters()
