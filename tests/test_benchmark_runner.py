@@ -117,12 +117,12 @@ def test_run_that_dies_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: 
     began: list[tuple[str, int]] = []
     learn = Run._learn
 
-    def learn_and_die_once(run: Run, model: Any, steps: int, progress_bar: bool) -> None:
+    def learn_and_die_once(run: Run, model: Any, steps: int) -> None:
         began.append((run.out.name, model.num_timesteps))
         if len(began) == 1:
-            learn(run, model, 25, progress_bar)  # a checkpoint at 20
+            learn(run, model, 25)  # a checkpoint at 20
             raise MemoryError("killed")
-        learn(run, model, steps, progress_bar)
+        learn(run, model, steps)
 
     monkeypatch.setattr(Run, "_learn", learn_and_die_once)
     assert Runner(grid.jobs(), runs, results).run(LocalPool(lambda job: run_job(job, runs))) == FINISHED
