@@ -185,6 +185,7 @@ def check_module(arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
         patch.setattr(argparse.ArgumentParser, "parse_args", parse_only)
         patch.setattr(sys, "argv", arguments)
         if arguments[:2] == ["sb3_have.zoo", "enjoy"]:
+            importlib.import_module("rl_zoo3.enjoy")  # first, or it would keep what stands in for its function
             patch.setattr("rl_zoo3.utils.get_model_path", lambda *_: None)  # as if one had been trained
         with pytest.raises(Parsed):
             runpy.run_module(module, run_name="__main__")
