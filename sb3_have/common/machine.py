@@ -10,8 +10,6 @@ from pathlib import Path
 import cv2
 import torch as th
 
-import sb3_have
-
 PACKAGES = ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "highway-env", "numpy")
 
 
@@ -29,7 +27,7 @@ def commit_of(folder: Path) -> str | None:
         return None
 
 
-COMMIT = commit_of(Path(sb3_have.__file__).resolve().parents[1])
+COMMIT = commit_of(Path(__file__).resolve().parents[2])
 """Of this package when it was imported: a checkout may go on while a training runs."""
 
 
@@ -42,7 +40,7 @@ def machine(device: str = "cpu") -> dict[str, str]:
     hardware = f"{cpu_model()}, {'with' if th.cpu._is_amx_tile_supported() else 'no'} AMX"
     if device != "cpu":
         hardware += f", {th.cuda.get_device_name(device)}"
-    own = f"sb3_have {sb3_have.__version__}" + (f" ({COMMIT})" if COMMIT else "")
+    own = f"sb3_have {version('sb3_have')}" + (f" ({COMMIT})" if COMMIT else "")
     packages = [own, f"Python {platform.python_version()}", *(f"{name} {version(name)}" for name in PACKAGES)]
     packages.append(f"opencv {cv2.__version__}")  # its distribution has several names
     return {"machine": hardware, "versions": ", ".join(packages)}
