@@ -251,3 +251,10 @@ def test_types_of_what_is_read(tmp_path: Path) -> None:
     (row,) = frame.to_dict("records")
     assert (row["episode_seed"], row["steps"], row["crashed"], row["weather"]) == (4_294_967_295, 20, 1, "none")
     assert np.isnan(row["distance"]) and np.isnan(row["offroad"])
+
+
+@pytest.mark.usefixtures("words_only")
+def test_report_where_no_sensor_could_fail(tmp_path: Path) -> None:
+    rows = [row for row in failure_rows({"have": {0: (100.0, 60.0)}}) if row["kind"] == "none"]
+    write(tmp_path / "core", final=final(), failures=rows)
+    assert "When a sensor fails" not in write_report(tmp_path / "core").read_text()

@@ -4,6 +4,7 @@ import copy
 import fcntl
 import gc
 import re
+import shutil
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -135,6 +136,15 @@ def test_folder_after_a_training_that_failed(tmp_path: Path) -> None:
 
     make_model().learn(9, [again, Forgets(), Watches(tmp_path)])
     take(tmp_path)
+
+
+def test_folder_made_anew_after_a_training_that_failed(tmp_path: Path) -> None:
+    folder = tmp_path / "run"
+    with pytest.raises(ZeroDivisionError):
+        make_model().learn(9, [ResumableCheckpointCallback(folder, 10), Fails()])
+    shutil.rmtree(folder)
+    make_model().learn(9, [ResumableCheckpointCallback(folder, 10), Watches(folder)])
+    take(folder)
 
 
 def test_algorithm_that_is_on_policy(tmp_path: Path) -> None:

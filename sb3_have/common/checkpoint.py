@@ -291,7 +291,10 @@ class ResumableCheckpointCallback(BaseCallback):
     def _on_training_start(self) -> None:
         self._last_step = self.model.num_timesteps
         self.folder.mkdir(parents=True, exist_ok=True)
-        self._lock = _locks.setdefault(self.folder.resolve(), ExitStack())
+        key = self.folder.resolve()
+        if stale := _locks.pop(key, None):  # of a training that failed; the folder may have been made anew since
+            stale.close()
+        self._lock = _locks[key] = ExitStack()
         try:
             self._lock.enter_context(locked(self.folder))
         except BlockingIOError as error:
