@@ -13,7 +13,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_have import HAVESAC, ModalityReplayBuffer
-from sb3_have.common.encoders import MultiModalEncoder, decode_bytes
+from sb3_have.common import encoders
+from sb3_have.common.encoders import ImageEncoder, MultiModalEncoder, decode_bytes
 
 # -- Schedules
 
@@ -66,6 +67,57 @@ def test_decoding_by_table_is_decoding_by_arithmetic(key: str, channels: int, pr
         decoded = encoder._decode(key, given, True, dtype)
         assert decoded.dtype == dtype and decoded.is_contiguous(memory_format=th.channels_last)
         assert th.equal(decoded, expected)
+
+
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+@pytest.mark.parametrize(("layer", "height", "width"), [((4, 8, 4), 36, 44), ((4, 4, 2), 16, 20), ((4, 16, 8), 32, 40)])
+def test_blocks_give_the_features_and_gradients_of_pixels(
+    layer: tuple[int, int, int], height: int, width: int, precision: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Space to depth is only another order of the same sums."""
+    space = spaces.Dict({key: spaces.Box(0, 255, (3, height, width), np.uint8) for key in ("rgb", "event")})
+    images = {key: th.as_tensor(space[key].sample()[None]).expand(2, -1, -1, -1) for key in space}
+    results = []
+    for has_avx512 in (True, False):
+        monkeypatch.setattr(encoders, "has_avx512", lambda has=has_avx512: has)
+        th.manual_seed(0)
+        kwargs = {key: {"layers": [layer]} for key in space}
+        encoder = MultiModalEncoder(space, features_dim=4, encoder_kwargs=kwargs, precision=precision)
+        assert [module.block_size for module in encoder.encoders] == [layer[2] if has_avx512 else 1] * 2
+        features = encoder(images)
+        (features * th.tensor([1.0, -2.0, 0.5, 3.0])).sum().backward()
+        results.append((features, *(parameter.grad for parameter in encoder.parameters())))
+    tolerance = {"float32": 1e-4, "bfloat16": 2e-2}[precision]
+    for blocks, pixels in zip(*results, strict=True):
+        assert blocks is not None and pixels is not None
+        th.testing.assert_close(blocks, pixels, rtol=tolerance, atol=tolerance * float(pixels.detach().abs().max()))
+
+
+@pytest.mark.parametrize(("layer", "size"), [((4, 3, 2), 32), ((4, 8, 4), 38), ((4, 4, 4), 32), ((4, 3, 1), 32)])
+def test_what_cannot_be_read_in_blocks_is_read_in_pixels(
+    layer: tuple[int, int, int], size: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(encoders, "has_avx512", lambda: True)
+    assert ImageEncoder(spaces.Box(0, 255, (3, size, size), np.uint8), 4, [layer]).block_size == 1
+
+
+def test_grouped_images_and_own_encoders_are_read_in_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A subclass may expect pixels, and the channels of two images are joined behind one another."""
+
+    class Own(ImageEncoder):
+        def forward(self, observations: th.Tensor) -> th.Tensor:
+            assert observations.shape[1:] == (3, 36, 36)
+            return super().forward(observations)
+
+    space = spaces.Dict({key: spaces.Box(0, 255, (3, 36, 36), np.uint8) for key in ("a", "b", "c")})
+    images = {key: th.as_tensor(space[key].sample()[None]) for key in space}
+    modalities, features = {"ab": ["a", "b"], "c": ["c"]}, []
+    for has_avx512 in (True, False):
+        monkeypatch.setattr(encoders, "has_avx512", lambda has=has_avx512: has)
+        th.manual_seed(0)
+        encoder = MultiModalEncoder(space, 4, modalities, encoder_classes={"c": Own}, precision="float32")
+        features.append(encoder(images))
+    assert th.equal(*features)
 
 
 def test_what_bytes_stand_for() -> None:

@@ -45,9 +45,14 @@ class ImageEncoder(nn.Module):
             layers = default_layers(min(height, width))
         modules: list[nn.Module] = []
         for filters, kernel_size, stride in layers:
-            modules += [nn.Conv2d(channels, filters, kernel_size, stride), nn.ReLU(inplace=True)]
+            conv_class = nn.Conv2d if modules else BlockConv2d
+            modules += [conv_class(channels, filters, kernel_size, stride), nn.ReLU(inplace=True)]
             channels = filters
         self.convolutions = nn.Sequential(*modules)
+        _, kernel_size, stride = layers[0]
+        fits = kernel_size > stride and kernel_size % stride == height % stride == width % stride == 0
+        # Side of the blocks of pixels in which :class:`BlockConv2d` reads the images fastest; 1 where it is pixels.
+        self.block_size = stride if fits and stride in (2, 4, 8) and has_avx512() else 1
         with th.no_grad():
             n_flatten = self.convolutions(th.zeros(1, *observation_space.shape)).numel()
         self.output = nn.Sequential(nn.Linear(n_flatten, features_dim), nn.LayerNorm(features_dim))
@@ -65,6 +70,23 @@ class ImageEncoder(nn.Module):
         """(batch, features_dim) of the maps after the last stage."""
         features: th.Tensor = self.output(maps.permute(0, 2, 3, 1).flatten(start_dim=1))  # a view, not a copy
         return features
+
+
+class BlockConv2d(nn.Conv2d):
+    """
+    A convolution that also reads images in blocks of stride x stride pixels (space to depth), see :func:`_look_up`.
+
+    The sums are the same: 8x8 with stride 4 on pixels is 2x2 with stride 1 on blocks of 4x4. On a CPU with AVX-512 the
+    latter takes 7 to 26% less time, forward and backward together. Without it the backward pass takes longer.
+    """
+
+    def forward(self, images: th.Tensor) -> th.Tensor:
+        if images.shape[1] == self.in_channels:
+            return super().forward(images)
+        stride, n = self.stride[0], self.kernel_size[0] // self.stride[0]
+        weight = self.weight.view(self.out_channels, self.in_channels, n, stride, n, stride)
+        weight = weight.permute(0, 3, 1, 5, 2, 4)  # (filters, row in block, channel, column in block, n, n)
+        return F.conv2d(images, weight.reshape(self.out_channels, -1, n, n), self.bias)
 
 
 def default_layers(size: int) -> list[tuple[int, int, int]]:
@@ -188,13 +210,14 @@ class MultiModalEncoder(nn.Module):
         if not isinstance(observations, dict):
             observations = {"observation": observations}
         if self.fusions:
-            images = [self._inputs(modality, observations) for modality in self.modalities.values()]
+            modules = zip(self.encoders, self.modalities.values(), strict=True)
+            images = [self._inputs(encoder, modality, observations) for encoder, modality in modules]
             with _autocast(images[0]):
                 encoded = encode_fused(list(self.encoders), self.fusions, images)
         else:
             encoded = []
             for encoder, modality in zip(self.encoders, self.modalities.values(), strict=True):
-                inputs = self._inputs(modality, observations)
+                inputs = self._inputs(encoder, modality, observations)
                 with _autocast(inputs):
                     encoded.append(encoder(inputs))
         for (name, modality), encoder, features in zip(self.modalities.items(), self.encoders, encoded, strict=True):
@@ -211,20 +234,24 @@ class MultiModalEncoder(nn.Module):
         bfloat16 = self.precision == "bfloat16" or (self.precision == "auto" and has_native_bfloat16(device.type))
         return th.bfloat16 if bfloat16 else th.float32
 
-    def _inputs(self, modality: Modality, observations: dict[str, th.Tensor]) -> th.Tensor:
+    def _inputs(self, encoder: nn.Module, modality: Modality, observations: dict[str, th.Tensor]) -> th.Tensor:
         """What a modality's encoder reads."""
         dtype = self.image_dtype(observations[modality.keys[0]].device) if modality.is_image else th.float32
-        decoded = [self._decode(key, observations[key], modality.is_image, dtype) for key in modality.keys]
+        # Subclasses may expect pixels, and the channels of several images cannot be joined in blocks
+        block_size = encoder.block_size if type(encoder) is ImageEncoder and len(modality.keys) == 1 else 1
+        decoded = [self._decode(key, observations[key], modality.is_image, dtype, block_size) for key in modality.keys]
         return decoded[0] if len(decoded) == 1 else th.cat(decoded, dim=1)
 
-    def _decode(self, key: str, observation: th.Tensor, is_image: bool, dtype: th.dtype) -> th.Tensor:
+    def _decode(
+        self, key: str, observation: th.Tensor, is_image: bool, dtype: th.dtype, block_size: int = 1
+    ) -> th.Tensor:
         if not is_image:
             return observation.to(dtype).flatten(start_dim=1)
         signed = key in self.signed_keys
         # the table is NumPy's, which no graph can hold
         traced = th.compiler.is_compiling() or th.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
         if self.normalize_images and observation.dtype == th.uint8 and observation.device.type == "cpu" and not traced:
-            return _look_up(observation, signed, dtype)
+            return _look_up(observation, signed, dtype, block_size)
         observation = observation.contiguous(memory_format=th.channels_last)  # before it has more bytes
         return (decode_bytes(observation, signed) if self.normalize_images else observation).to(dtype)
 
@@ -286,13 +313,28 @@ def decode_bytes(values: th.Tensor, signed: bool) -> th.Tensor:
     return values.to(th.float32) / 255
 
 
-def _look_up(images: th.Tensor, signed: bool, dtype: th.dtype) -> th.Tensor:
+def _look_up(images: th.Tensor, signed: bool, dtype: th.dtype, block_size: int = 1) -> th.Tensor:
     """
-    :func:`decode_bytes` of uint8 images (B, C, H, W) in the CPU's memory, to channels last: by a table, image by image,
-    so that the bytes stay in the processor's cache between the transposition and the table.
+    :func:`decode_bytes` of uint8 images in the CPU's memory by a table, which is faster than arithmetic.
+
+    :param images: (B, C, H, W)
+    :param signed: whether the bytes are signed counts
+    :param dtype: float32 or bfloat16
+    :param block_size: side n of the blocks in which the images are laid out for :class:`BlockConv2d`: 2, 4 or 8; 1 for
+        none
+    :return: (B, n*n*C, H/n, W/n) in channels-last memory, the channels in the order row in block, channel, column in
+        block
     """
     batch, channels, height, width = images.shape
     table = _table(signed, dtype)
+    if block_size > 1:
+        # The pixels of a row of a block are moved as one integer
+        rows = images.contiguous().numpy().view(f"u{block_size}")
+        rows = rows.reshape(batch, channels, height // block_size, block_size, width // block_size)
+        blocks = np.ascontiguousarray(rows.transpose(0, 2, 4, 3, 1)).view(np.uint8)
+        decoded = th.from_numpy(cv2.LUT(blocks.reshape(1, -1), table)).view(dtype)
+        return decoded.view(batch, height // block_size, width // block_size, -1).permute(0, 3, 1, 2)
+    # Image by image, so that the bytes stay in the processor's cache between the transposition and the table
     values = np.empty((batch, 1, height * width * channels), table.dtype)
     transposed = np.empty((height * width, channels), np.uint8)
     for image, decoded in zip(images.contiguous().numpy(), values, strict=True):
@@ -311,6 +353,11 @@ def _table(signed: bool, dtype: th.dtype) -> np.ndarray:
 def _autocast(inputs: th.Tensor) -> th.autocast:
     """Arithmetic of the type of ``inputs``."""
     return th.autocast(inputs.device.type, dtype=inputs.dtype, enabled=inputs.dtype != th.float32)
+
+
+def has_avx512() -> bool:
+    """Whether the CPU computes with AVX-512."""
+    return th.backends.cpu.get_cpu_capability() == "AVX512"
 
 
 @th.compiler.assume_constant_result  # type: ignore[untyped-decorator]
