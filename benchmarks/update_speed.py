@@ -358,6 +358,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--shapes", nargs="+", choices=list(SHAPES), default=list(SHAPES))
     parser.add_argument("--modalities", nargs="+", type=int, choices=range(1, 6), help="default: 1 2 3 5 at a, 2 at b")
     parser.add_argument("--precisions", nargs="+", choices=("float32", "bfloat16"), default=["float32", "bfloat16"])
+    parser.add_argument("--batch-size", type=int, help="default: 64 at a, 128 at b")
     parser.add_argument("--rounds", type=int, help="default: 30 at a, 7 at b")
     parser.add_argument("--skip-sb3", action="store_true")
     parser.add_argument("--device", default="cpu")
@@ -377,6 +378,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if args.storage:
         kwargs["replay_buffer_kwargs"] = {"storage": args.storage}
         options += f" storage={args.storage}"
+    if args.batch_size:
+        options += f" batch-size={args.batch_size}"
     if args.retain_memory:
         if not keep_freed_memory():
             parser.error("--retain-memory: the C library has no mallopt")
@@ -386,6 +389,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     rows: list[Row] = []
     for name in args.shapes:
         shape = SHAPES[name]
+        if args.batch_size:
+            shape = shape._replace(batch_size=args.batch_size)
         for modalities in args.modalities or shape.modalities:
             measured = measure(
                 shape, modalities, args.precisions, args.rounds, not args.skip_sb3, args.device, **kwargs
