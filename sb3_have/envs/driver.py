@@ -27,14 +27,32 @@ class Driver(IDMVehicle):
             return
         if self.enable_lane_change:
             self.change_lane_policy()
-        lanes = [self.lane_index]
+        acceleration = self.acceleration(self, *self.road.neighbour_vehicles(self, self.lane_index))
         if self.target_lane_index != self.lane_index:
-            lanes.append(self.target_lane_index)
-        acceleration = min(self.acceleration(self, *self.road.neighbour_vehicles(self, lane)) for lane in lanes)
+            changing = self.acceleration(self, *self.road.neighbour_vehicles(self, self.target_lane_index))
+            acceleration = min(acceleration, changing)
         self.action = {
             "steering": self.steering_control(self.target_lane_index),
             "acceleration": _clip(acceleration, -self.ACC_MAX, self.ACC_MAX),
         }
+
+    def step(self, dt: float) -> None:
+        self.timer += dt
+        self.clip_actions()
+        steering, speed, heading = self.action["steering"], float(self.speed), float(self.heading)
+        slip_angle = float(np.arctan(0.5 * np.tan(steering)))
+        course = heading + slip_angle
+        x, y = self.position.tolist()
+        x += speed * float(np.cos(course)) * dt
+        y += speed * float(np.sin(course)) * dt
+        self.position[:] = x, y
+        if self.impact is not None:
+            self.position += self.impact
+            self.crashed = True
+            self.impact = None
+        self.heading = heading + speed * float(np.sin(slip_angle)) / (self.LENGTH / 2) * dt
+        self.speed = speed + self.action["acceleration"] * dt
+        self.on_state_update()
 
     def steering_control(self, target_lane_index: LaneIndex) -> float:
         lane = self.road.network.get_lane(target_lane_index)
@@ -57,7 +75,7 @@ class Driver(IDMVehicle):
         speed_ratio = max(ego_vehicle.speed, 0) / abs(not_zero(target_speed))
         acceleration = self.COMFORT_ACC_MAX * (1 - float(np.power(speed_ratio, self.DELTA)))
         if front_vehicle is not None:
-            distance = float(front_vehicle.position[0] - ego_vehicle.position[0])  # squared: no matter whither
+            distance = float(front_vehicle.position[0] - ego_vehicle.position[0])  # squared, so the direction does not matter
             gap_ratio = self.desired_gap(ego_vehicle, front_vehicle) / not_zero(distance)
             acceleration -= self.COMFORT_ACC_MAX * float(np.power(gap_ratio, 2))
         return float(acceleration)
@@ -65,8 +83,8 @@ class Driver(IDMVehicle):
     def desired_gap(self, ego_vehicle: Vehicle, front_vehicle: Vehicle | None = None, projected: bool = True) -> float:
         if front_vehicle is None or not projected:
             return super().desired_gap(ego_vehicle, front_vehicle, projected)  # type: ignore[no-any-return]
-        speed, direction = float(ego_vehicle.speed), ego_vehicle.direction
-        approach = float(np.dot(speed * direction - front_vehicle.velocity, direction))
+        direction, velocity = self.road.motion(ego_vehicle)
+        speed, approach = float(ego_vehicle.speed), float(np.dot(velocity - self.road.motion(front_vehicle)[1], direction))
         braking = 2 * math.sqrt(-self.COMFORT_ACC_MAX * self.COMFORT_ACC_MIN)
         return float(self.DISTANCE_WANTED + speed * self.TIME_WANTED + speed * approach / braking)
 
@@ -79,7 +97,7 @@ class NeverReverses(Vehicle):
 
     def step(self, dt: float) -> None:
         super().step(dt)
-        self.speed = float(np.clip(self.speed, self.MIN_SPEED, self.MAX_SPEED))
+        self.speed = _clip(float(self.speed), self.MIN_SPEED, self.MAX_SPEED)
 
 
 class ScenarioDriver(NeverReverses, Driver):

@@ -200,7 +200,7 @@ class HighwayVisionEnv(AbstractEnv):
 
     def _snapshot(self) -> np.ndarray:
         """Poses (N+1, 3) of the ego vehicle and the traffic: x [m], y [m], heading [rad]."""
-        return np.array([(*v.position, v.heading) for v in self.road.vehicles])
+        return np.array([(*v.position.tolist(), v.heading) for v in self.road.vehicles])
 
     def observe_sensors(self) -> dict[str, np.ndarray]:
         """What the sensors saw since the last observation; advances them, so called once per control step."""

@@ -46,17 +46,19 @@ class BentLane(AxisLane):
         return along if self.sign > 0 else along + math.pi
 
     def occupants(self, placed: list[tuple[float, float, Vehicle]]) -> list[tuple[float, Vehicle]]:
-        sign, reach = self.sign, self.shape.lane_width / 2 + 1
-        return [(sign * x, vehicle) for x, y, vehicle in placed if abs(y - self._y(x)) <= reach]
+        sign, centre, bend, reach = self.sign, self.centre, self.shape.bend, self.shape.lane_width / 2 + 1
+        return [(sign * x, vehicle) for x, y, vehicle in placed if abs(y - (centre + bend(x))) <= reach]
 
     def _mirrored(self, x: float) -> float:
         return x if self.sign > 0 else ROAD_LENGTH - x
 
     def _y(self, x: float) -> float:
-        return self.centre + float(self.shape.bend(x))
+        bend: float = self.shape.bend(x)
+        return self.centre + bend
 
     def _slope(self, x: float) -> float:
-        return float(self.shape.slope(x))
+        slope: float = self.shape.slope(x)
+        return slope
 
 
 class RampLane(BentLane):

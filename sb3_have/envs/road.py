@@ -82,11 +82,12 @@ class HighwayRoad(Road):
 
     _placed: list[tuple[float, float, Vehicle]] | None = None
     _on_lane: dict[LaneIndex, list[tuple[float, Vehicle]]]
+    _motions: dict[Vehicle, tuple[np.ndarray, np.ndarray]]
 
     def act(self) -> None:
         # Nobody moves while everybody decides: place each vehicle on each lane only once.
         self._placed = [(*v.position.tolist(), v) for v in self.vehicles]
-        self._on_lane = {}
+        self._on_lane, self._motions = {}, {}
         try:
             super().act()
         finally:
@@ -113,6 +114,16 @@ class HighwayRoad(Road):
                 x_rear, rear = x_other, other
         return front, rear
 
+    def motion(self, vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray]:
+        """A vehicle's direction, a unit vector, and its velocity [m/s]."""
+        motion = None if self._placed is None else self._motions.get(vehicle)
+        if motion is None:
+            direction = vehicle.direction
+            motion = direction, vehicle.speed * direction
+            if self._placed is not None:
+                self._motions[vehicle] = motion
+        return motion
+
     def step(self, dt: float) -> None:
         for vehicle in self.vehicles:
             vehicle.step(dt)
@@ -120,7 +131,7 @@ class HighwayRoad(Road):
             vehicle.handle_collisions(other, dt)
 
     def _close_pairs(self, dt: float) -> list[tuple[Vehicle, Vehicle]]:
-        """All pairs that pass the pre-check of ``handle_collisions`` and few others, in the order of the vehicles."""
+        """All pairs that ``handle_collisions`` might find to collide and few others, in the order of the vehicles."""
         reach = max(v.diagonal for v in self.vehicles) + max(abs(v.speed) for v in self.vehicles) * dt + 1.0
         along = sorted((float(v.position[0]), number) for number, v in enumerate(self.vehicles))
         pairs = []
@@ -129,4 +140,20 @@ class HighwayRoad(Road):
                 if x_other - x > reach:
                     break
                 pairs.append((min(number, other), max(number, other)))
-        return [(self.vehicles[i], self.vehicles[j]) for i, j in sorted(pairs)]
+        close = [(self.vehicles[i], self.vehicles[j]) for i, j in sorted(pairs)]
+        return [pair for pair in close if not _pass_by(*pair, dt)]
+
+
+def _pass_by(one: Vehicle, other: Vehicle, dt: float) -> bool:
+    """
+    Whether two vehicles are sure to stay clear of each other, side by side, for another step: whether they and their
+    motion leave a gap across the one's heading, one of the four directions in which ``handle_collisions`` would look
+    for it at length.
+    """
+    heading, turn = float(one.heading), float(other.heading - one.heading)
+    dx, dy = (other.position - one.position).tolist()
+    gap = abs(dy * math.cos(heading) - dx * math.sin(heading))
+    slant = abs(math.sin(turn))
+    half_widths = 0.5 * (one.WIDTH + slant * other.LENGTH + abs(math.cos(turn)) * other.WIDTH)
+    # The one moves along its heading, not across it. The centimetre is far more than any rounding.
+    return gap > half_widths + abs(other.speed) * dt * slant + 0.01

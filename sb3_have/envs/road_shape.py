@@ -28,6 +28,8 @@ RAMP_ENDS: Final = 460.0
 #: The pavement goes on beyond the outer lines [m].
 SHOULDER_WIDTH: Final = 2.0
 
+_WAVE: Final = 2 * math.pi / PERIOD
+
 SCENARIOS: Final = ("highway", "merge", "curves")
 
 
@@ -71,11 +73,11 @@ class RoadShape:
 
     def bend(self, x: Any) -> Any:
         """How far the road lies to the right of the x axis [m]."""
-        return self.swing * _sin(2 * math.pi / PERIOD * x)
+        return self.swing * _sin(_WAVE * x)
 
     def slope(self, x: Any) -> Any:
         """Derivative of :meth:`bend`, the tangent of the road's heading."""
-        return self.swing * 2 * math.pi / PERIOD * _sin(2 * math.pi / PERIOD * x + 0.5 * math.pi)
+        return self.swing * 2 * math.pi / PERIOD * _sin(_WAVE * x + 0.5 * math.pi)
 
     def direction(self, x: float) -> tuple[float, float]:
         """Unit vector along the road."""
