@@ -11,7 +11,7 @@
 # correctness.csv, compile.csv, update_speed.csv, graph.csv, training.csv, curves.tar.gz and log.txt. Of the machine it
 # uses Python with torch and what goes with it; the wheels are unpacked into a temporary folder. Every part has a time
 # limit, and one that fails stops none of the others; the exit code is 1 if any failed. LIMIT is the time in all, in
-# seconds; the checks take 90 of it at most, the speed 200, the graph 90, and the training what is left.
+# seconds; the checks take 100 of it at most, the speed 160, the graph 90, and the training what is left.
 set -uo pipefail
 cd "$(dirname "$0")/../.." || exit 1
 DEVICE=${DEVICE:-cuda}
@@ -54,7 +54,8 @@ part() {
     return "$code"
 }
 
-# Without --no-deps, pip would replace torch and NumPy. sb3_have runs from the tree, and needs to be known by its version.
+# Without --no-deps, pip would replace torch and NumPy. sb3_have runs from the tree, and needs to be known by its
+# version.
 "$PYTHON" -m pip install --quiet --no-deps --no-index --no-compile --no-cache-dir --disable-pip-version-check \
     --find-links "$WHEELS" --target "$site" "$WHEELS"/*.whl || exit 1
 version=$(cat sb3_have/version.txt)
@@ -64,7 +65,7 @@ export PYTHONPATH="$PWD:$site${PYTHONPATH:+:$PYTHONPATH}"
 export PYTHONUNBUFFERED=1 OMP_NUM_THREADS=1 SDL_VIDEODRIVER=dummy
 export TORCHINDUCTOR_CACHE_DIR=$site/inductor
 command -v nvidia-smi >/dev/null && nvidia-smi --query-gpu=name,driver_version,memory.total --format=csv
-"$PYTHON" -c 'import sys, torch; print("Python", sys.version.split()[0], "torch", torch.__version__, torch.version.cuda)'
+"$PYTHON" -c 'import sys, torch; print("Python", *sys.version.split()[:1], "torch", torch.__version__)'
 
 if [ "$DEVICE" = cpu ]; then
     checks=(--image-size 36 --batch-size 8)
@@ -78,7 +79,13 @@ else
     training=()
 fi
 
-speed() { part "$1" benchmarks.update_speed --device "$DEVICE" --output "$OUT/update_speed.csv" "${speed[@]}" "${@:2}"; }
+# Rows of update_speed, until $until at the latest.
+speed() {
+    local limit=$1
+    shift
+    if [ $((until - SECONDS)) -lt "$limit" ]; then limit=$((until - SECONDS)); fi
+    part "$limit" benchmarks.update_speed --device "$DEVICE" --output "$OUT/update_speed.csv" "${speed[@]}" "$@"
+}
 
 # While the checks run, whose speed is of no interest: is what is compiled right, and the compiler's cache for later.
 compile_meanwhile() {
@@ -94,7 +101,8 @@ for name in "${PARTS[@]}"; do
     case $name in
         checks)
             [ "$DEVICE" = cpu ] || compile_meanwhile
-            part 90 benchmarks.gpu.checks --device "$DEVICE" --output "$OUT/correctness.csv" --skip compile "${checks[@]}"
+            part 90 benchmarks.gpu.checks --device "$DEVICE" --output "$OUT/correctness.csv" --skip compile \
+                "${checks[@]}"
             if [ "$DEVICE" != cpu ]; then
                 wait "$compile" || failed=1
                 wait "$warm_up" || echo "-- the compiler's cache is not complete"
@@ -103,6 +111,7 @@ for name in "${PARTS[@]}"; do
             fi
             ;;
         speed)
+            until=$((SECONDS + 160))
             if [ "$DEVICE" = cpu ]; then
                 speed 60
             else
@@ -110,13 +119,14 @@ for name in "${PARTS[@]}"; do
                 speed 45 --shapes b
                 speed 45 --shapes b --storage device --batch-size 512
                 speed 35 --shapes a
-                speed 60 --shapes b --storage device --compile
+                speed 90 --shapes b --storage device --compile
             fi
             ;;
         graph)
             part 90 benchmarks.gpu.graph --device "$DEVICE" --output "$OUT/graph.csv" "${graph[@]}"
             ;;
         compile)
+            until=$LIMIT
             part 120 benchmarks.gpu.checks --device "$DEVICE" --output "$OUT/compile.csv" --only compile "${checks[@]}"
             if [ "$DEVICE" != cpu ]; then
                 speed 90 --shapes b --storage device --batch-size 512 --compile
