@@ -15,6 +15,7 @@ from pathlib import Path
 
 import gymnasium as gym
 import pandas as pd
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_have.benchmark.grid import Grid, read_grid
 from sb3_have.benchmark.reading import FILES
@@ -57,7 +58,16 @@ def drive(grid: Grid, processes: int = 1) -> pd.DataFrame:
     }
     parts = []
     for name, (driver, env_id) in drivers.items():
-        rows = evaluate(driver, env_id, grid.weathers, grid.final_episodes, FINAL_SEED, env_kwargs, n_envs=processes)
+        rows = evaluate(
+            driver,
+            env_id,
+            grid.weathers,
+            grid.final_episodes,
+            FINAL_SEED,
+            env_kwargs,
+            n_envs=processes,
+            vec_env_cls=SubprocVecEnv if processes > 1 else DummyVecEnv,
+        )
         print(
             f"{name}: return {rows['return_mean'].mean():.1f}, distance {rows['distance_mean'].mean():.0f} m",
             flush=True,

@@ -91,7 +91,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--severity", type=int, default=3, choices=(1, 2, 3))
     parser.add_argument("--episodes", type=int, default=2, help="in each weather")
     parser.add_argument("--seed", type=int, default=0, help="of the episodes")
-    parser.add_argument("--envs", type=int, default=2, help="processes")
+    parser.add_argument("--envs", type=int, default=16, help="driven at a time")
     parser.add_argument("--out", type=Path, default=RESULTS / "failures.csv")
     args = parser.parse_args(arguments)
 

@@ -53,6 +53,9 @@ from sb3_have.run_callback import TrainingStopped, is_due
 EVALUATION_SEED = 1_000_000
 """Of the episodes that evaluate a run while it trains: the same for all runs."""
 
+VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}
+"""By the Zoo's names."""
+
 KEPT_CHECKPOINTS = 2
 """Of which the older one is for the case that the newest is damaged."""
 
@@ -106,12 +109,13 @@ class Run:
     :param algo: name in :func:`algorithms`
     :param eval_freq: steps from one evaluation to the next, 0 for none
     :param eval_episodes: episodes in each weather of an evaluation
-    :param eval_envs: processes that evaluate
+    :param eval_envs: environments of an evaluation at a time, with one ``predict`` for all of them
     :param eval_env_kwargs: for the evaluation's environments, over the configuration's ``env_kwargs``
     :param weathers: to evaluate in
     :param save_freq: steps from one checkpoint to the next, 0 for one at the end only
     :param time_limit: of the training in this call [s], None for none
     :param device: of the model
+    :param eval_vec_env_cls: ``SubprocVecEnv`` steps each environment of an evaluation in a process of its own
     """
 
     def __init__(
@@ -129,9 +133,11 @@ class Run:
         save_freq: int = 5_000,
         time_limit: float | None = None,
         device: str = "auto",
+        eval_vec_env_cls: type[DummyVecEnv] | type[SubprocVecEnv] = DummyVecEnv,
     ) -> None:
         self.config, self.env_id, self.out, self.seed, self.algo = dict(config), env_id, Path(out), seed, algo
-        self.eval_freq, self.eval_episodes, self.eval_envs = eval_freq, eval_episodes, eval_envs
+        self.eval_freq, self.eval_episodes = eval_freq, eval_episodes
+        self.eval_envs, self.eval_vec_env_cls = eval_envs, eval_vec_env_cls
         env_kwargs = {**config.get("env_kwargs", {}), **(eval_env_kwargs or {})}
         self.eval_env_kwargs = evaluation_env_kwargs({"env_kwargs": env_kwargs})
         self.weathers, self.save_freq, self.time_limit = weathers, save_freq, time_limit
@@ -278,6 +284,7 @@ class Run:
             n_envs=self.eval_envs,
             env_wrapper=env_wrapper(self.config),
             progress_bar=self._progress_bar,
+            vec_env_cls=self.eval_vec_env_cls,
         )
         frame.insert(0, "step", step)
         frame.insert(1, "seed", self.seed)
@@ -312,7 +319,13 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of the run; the same folder resumes it")
     parser.add_argument("--eval-freq", type=int, default=10_000, help="steps between evaluations, 0 for none")
     parser.add_argument("--eval-episodes", type=int, default=2, help="in each weather")
-    parser.add_argument("--eval-envs", type=int, default=1, help="processes that evaluate")
+    parser.add_argument("--eval-envs", type=int, default=1, help="that are driven at a time; default: %(default)s")
+    parser.add_argument(
+        "--eval-vec-env",
+        choices=list(VEC_ENVS),
+        default="dummy",
+        help="all of them in this process, or each in one of its own; default: %(default)s",
+    )
     parser.add_argument(
         "--eval-env-kwargs",
         nargs="+",
@@ -341,6 +354,7 @@ def main(arguments: list[str] | None = None) -> None:
         save_freq=args.save_freq,
         time_limit=args.time_limit,
         device=args.device,
+        eval_vec_env_cls=VEC_ENVS[args.eval_vec_env],
     )
     model = run.train(args.steps or int(config["n_timesteps"]), progress_bar=args.progress_bar)
     print(f"{model.num_timesteps} steps, {run.seconds / 60:.1f} min, {args.out / 'model.zip'}")

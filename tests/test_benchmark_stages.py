@@ -2,10 +2,13 @@
 
 import os
 import signal
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import pandas as pd
 import pytest
 from fake_drive import ENV_ID
 from tiny_grid import FAILURES, TINY, make_grid, read
@@ -15,6 +18,7 @@ from sb3_have.benchmark import stages
 from sb3_have.benchmark.grid import Job
 from sb3_have.benchmark.results import is_finished, merge
 from sb3_have.benchmark.stages import FINAL_SEED, collect, run_job
+from sb3_have.common.episodes import Task
 from sb3_have.train import EVALUATION_SEED, Run, newest_checkpoint
 
 
@@ -22,37 +26,59 @@ def test_evaluation_seeds_are_not_those_of_training() -> None:
     assert FINAL_SEED != EVALUATION_SEED and min(FINAL_SEED, EVALUATION_SEED) > 100_000
 
 
-def test_stages_go_on_weather_by_weather(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stages_go_on_where_they_were(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each in one go; what a stage has from elsewhere is not driven again."""
     job = make_grid(tmp_path, failures=FAILURES).jobs()[1]
-    driven: list[tuple[str, Any]] = []
-    drive, watch = stages._drive, stages.weights_of_episode
+    driven: list[Any] = []
+    drive, watch = stages._drive, stages.weights_of_episodes
 
-    def stop_at(number: int) -> None:
-        driven.append(("stop", number))
-        if len(driven) == number:
+    def counted(what: Callable[..., Any], job: Job, model: Any, tasks: Sequence[Task]) -> Any:
+        if len(driven) == stop:
             raise KeyboardInterrupt
+        failures = [task.env_wrapper.keywords.get("failure") or {} for task in tasks]  # type: ignore[union-attr]
+        told = [(task.weather, case.get("kind")) for task, case in zip(tasks, failures, strict=True)]
+        driven.append((what.__name__, told))
+        return what(job, model, tasks)
 
-    def counted_drive(job: Job, model: Any, weather: str, n: int, failure: dict[str, Any] | None = None) -> Any:
-        stop_at(stop)
-        driven[-1] = (weather, None if failure is None else (failure["modality"], failure["kind"]))
-        return drive(job, model, weather, n, failure)
-
-    def counted_watch(job: Job, model: Any, task: Any) -> Any:
-        stop_at(stop)
-        driven[-1] = (task.weather, "weights")
-        return watch(job, model, task)
-
-    monkeypatch.setattr(stages, "_drive", counted_drive)
-    monkeypatch.setattr(stages, "weights_of_episode", counted_watch)
-    for stop in (2, 4, 8):  # noqa: B007 (the functions above read it)
+    monkeypatch.setattr(stages, "_drive", partial(counted, drive))
+    monkeypatch.setattr(stages, "weights_of_episodes", partial(counted, watch))
+    for stop in (0, 1, 2):  # noqa: B007 (the function above reads it)
         with pytest.raises(KeyboardInterrupt):
             run_job(job, tmp_path)
-        driven.pop()
+    episodes = tmp_path / job.name / "final-30" / "episodes.csv"
+    whole = episodes.read_text()
+    rows = whole.splitlines(keepends=True)
+    episodes.write_text("".join(row for row in rows if not row.startswith("fast")))
     stop = 99
     assert run_job(job, tmp_path)
-    broken = [("depth", "black"), ("rgb", "black"), ("rgb", "overexposure")]
-    expected: list[tuple[str, Any]] = [(w, what) for what in (None, "weights") for w in ("slow", "fast")]
-    assert driven == expected + [(w, case) for w in ("slow", "fast") for case in broken]
+    assert episodes.read_text() == whole
+    slow, fast = [("slow", None)], [("fast", None)]
+    broken = [(weather, kind) for weather in ("slow", "fast") for kind in ("black", "black", "overexposure")]
+    assert driven == [
+        ("_drive", slow * 3 + fast * 3),
+        ("weights_of_episodes", slow + fast),
+        ("_drive", fast * 3),
+        ("_drive", [case for case in broken for _ in range(2)]),
+    ]
+    assert run_job(job, tmp_path) and len(driven) == 4
+
+
+def test_stages_do_not_depend_on_the_number_of_environments(tmp_path: Path) -> None:
+    """A model sees other observations under each failure, and its actions are in the return."""
+    files = {}
+    for eval_envs in (1, 5):
+        job = make_grid(tmp_path, failures=FAILURES, eval_envs=eval_envs).jobs()[1]
+        assert run_job(job, tmp_path / str(eval_envs))
+        final = tmp_path / str(eval_envs) / job.name / "final-30"
+        tables = {name: pd.read_csv(final / f"{name}.csv") for name in ("episodes", "weights", "failures")}
+        order = ["weather", "episode_seed", "t", "modality", "kind"]
+        files[eval_envs] = {
+            name: table.sort_values([c for c in order if c in table], ignore_index=True)
+            for name, table in tables.items()
+        }
+    for name, table in files[1].items():
+        pd.testing.assert_frame_equal(table, files[5][name], atol=2e-4)
+    assert files[1]["failures"]["return_mean"].nunique() == 8
 
 
 def test_failures_may_be_asked_for_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

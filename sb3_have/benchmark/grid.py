@@ -12,6 +12,7 @@ A grid is a YAML file; only ``methods`` and ``seeds`` have to be there::
     eval_freq: 5000                # steps between the points of the learning curve, 0 for none
     eval_episodes: 1               # of a point, in each weather
     final_episodes: 10             # after training, in each weather
+    eval_envs: 16                  # driven at a time in either, all in the run's process
     save_freq: 5000                # steps between checkpoints
     failures: {kinds: [black, frozen, noise], severity: 3, episodes: 1}   # after that; left out: none
 
@@ -77,6 +78,7 @@ class Grid:
     eval_freq: int = 5_000
     eval_episodes: int = 1
     final_episodes: int = 10
+    eval_envs: int = 16
     save_freq: int = 5_000
     failures: Failures | None = None
 
@@ -350,6 +352,7 @@ GRID_KEYS: dict[str, Reader] = {
     "hyperparams": _hyperparams,
     "eval_freq": _whole(0),
     "eval_episodes": _whole(1),
+    "eval_envs": _whole(1),
     "final_episodes": _whole(1),
     "save_freq": _whole(0),
     "failures": _failures,

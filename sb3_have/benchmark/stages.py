@@ -4,7 +4,7 @@ All of it goes into the run's folder, step by step and each step whole, so that 
 
     monitor.csv, evaluation.csv, checkpoint-<step>, model.zip    of :class:`sb3_have.train.Run`
     final-<steps>/training.json                                   the training is over; what it took
-    final-<steps>/episodes.csv, weights.csv, failures.csv         a weather at a time
+    final-<steps>/episodes.csv, weights.csv, failures.csv         each in one go
 """
 
 from __future__ import annotations
@@ -13,12 +13,14 @@ import contextlib
 import json
 import math
 import shutil
+from collections import deque
 from collections.abc import Sequence
 from functools import partial
-from itertools import count
+from itertools import count, product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
@@ -29,7 +31,7 @@ from sb3_have.benchmark.reading import FILES
 from sb3_have.benchmark.results import difference, read_text_table, settings_column
 from sb3_have.common.checkpoint import checkpoint_step, checkpoints
 from sb3_have.common.episodes import EpisodeQueue, Task, match_observations
-from sb3_have.common.evaluation import evaluate_episodes, summarize
+from sb3_have.common.evaluation import drive_tasks, episode_tasks, summarize
 from sb3_have.common.files import locked, write_atomically
 from sb3_have.common.machine import machine
 from sb3_have.configuration import Env, env_wrapper, evaluation_env_kwargs
@@ -92,6 +94,7 @@ def trained(job: Job, folder: Path, device: str) -> OffPolicyAlgorithm | None:
         algo=job.algo,
         eval_freq=grid.eval_freq,
         eval_episodes=grid.eval_episodes,
+        eval_envs=grid.eval_envs,
         weathers=grid.weathers,
         save_freq=grid.save_freq,
         device=device,
@@ -163,27 +166,23 @@ def has_weights(model: OffPolicyAlgorithm) -> bool:
 def drive_finally(job: Job, model: OffPolicyAlgorithm, folder: Path) -> None:
     """Deterministic episodes in each weather: ``episodes.csv``."""
     grid, path = job.grid, final_folder(job, folder) / "episodes.csv"
-    for weather in grid.weathers:
-        if len(_rows_of(path, weather=weather)) == grid.final_episodes:
-            continue
-        episodes = _drive(job, model, weather, grid.final_episodes)
-        _replace(path, episodes, {"weather": weather})
+    missing = [w for w in grid.weathers if len(_rows_of(path, weather=w)) != grid.final_episodes]
+    if missing:
+        tasks = episode_tasks(missing, grid.final_episodes, FINAL_SEED, partial(_wrapped, config=job.config))
+        tasks.sort(key=lambda task: missing.index(task.weather))
+        _replace(path, _drive(job, model, tasks), [{"weather": weather} for weather in missing])
 
 
-def _drive(
-    job: Job, model: OffPolicyAlgorithm, weather: str, n_episodes: int, failure: dict[str, Any] | None = None
-) -> pd.DataFrame:
-    """Episodes as rows of ``episodes.csv``, a sensor failing if asked for."""
-    wrapper = partial(_wrapped, config=job.config, failure=failure)
-    episodes = evaluate_episodes(
-        model, job.grid.env, [weather], n_episodes, FINAL_SEED, evaluation_env_kwargs(job.config), env_wrapper=wrapper
-    ).rename(columns={"seed": "episode_seed"})
+def _drive(job: Job, model: OffPolicyAlgorithm, tasks: Sequence[Task]) -> pd.DataFrame:
+    """Episodes as rows of ``episodes.csv``, in the order of the tasks."""
+    grid = job.grid
+    episodes = drive_tasks(model, grid.env, tasks, evaluation_env_kwargs(job.config), grid.eval_envs)
     for column in ("crashed", "offroad"):
         episodes[column] = episodes[column].map({0.0: False, 1.0: True})  # NaN stays
-    return episodes.round({"return": DIGITS, "distance": DIGITS})
+    return episodes.rename(columns={"seed": "episode_seed"}).round({"return": DIGITS, "distance": DIGITS})
 
 
-def _wrapped(env: Env, config: dict[str, Any], failure: dict[str, Any] | None) -> Env:
+def _wrapped(env: Env, config: dict[str, Any], failure: dict[str, Any] | None = None) -> Env:
     """As in training, a failing sensor outermost."""
     inner = env_wrapper(config)
     env = env if inner is None else inner(env)
@@ -193,29 +192,35 @@ def _wrapped(env: Env, config: dict[str, Any], failure: dict[str, Any] | None) -
 def watch_weights(job: Job, model: OffPolicyAlgorithm, folder: Path) -> None:
     """The modalities' weights at each step of the first final episode in each weather: ``weights.csv``."""
     path = final_folder(job, folder) / "weights.csv"
-    for weather in job.grid.weathers:
-        if len(_rows_of(path, weather=weather)):
-            continue
+    missing = [weather for weather in job.grid.weathers if not len(_rows_of(path, weather=weather))]
+    wrapper, tasks = partial(_wrapped, config=job.config), []
+    for weather in missing:
         seed = int(_rows_of(path.with_name("episodes.csv"), weather=weather)["episode_seed"].iloc[0])
-        _replace(path, weights_of_episode(job, model, Task(weather, seed)), {"weather": weather})
+        tasks.append(Task(weather, seed, wrapper))
+    for start in range(0, len(tasks), job.grid.eval_envs):
+        rows = weights_of_episodes(job, model, tasks[start : start + job.grid.eval_envs])
+        _replace(path, rows, [{"weather": weather} for weather in missing[start : start + job.grid.eval_envs]])
 
 
-def weights_of_episode(job: Job, model: Any, task: Task) -> pd.DataFrame:
-    """A row per step and modality: its weight before the action, and the return up to there."""
-    wrapper = partial(_wrapped, config=job.config, failure=None)
-    make = partial(EpisodeQueue, job.grid.env, [task], evaluation_env_kwargs(job.config), wrapper)
-    env = match_observations(DummyVecEnv([make]), model)
-    rows, so_far = [], 0.0
+def weights_of_episodes(job: Job, model: Any, tasks: Sequence[Task]) -> pd.DataFrame:
+    """A row per episode, step and modality: its weight before the action, and the return up to there."""
+    env_kwargs = evaluation_env_kwargs(job.config)
+    makers: list[Any] = [partial(EpisodeQueue, job.grid.env, deque([(0, task)]), env_kwargs) for task in tasks]
+    env = match_observations(DummyVecEnv(makers), model)
+    rows, so_far, driving = [], np.zeros(len(tasks)), np.ones(len(tasks), bool)
     try:
         observations = env.reset()
         for t in count():
-            for modality, weight in model.modality_weights(observations).items():
-                told = {"weight": float(weight[0]), "return_so_far": so_far}
-                rows.append({"weather": task.weather, "episode_seed": task.seed, "t": t, "modality": modality, **told})
+            weights = model.modality_weights(observations)
+            for i, (modality, weight) in product(np.flatnonzero(driving).tolist(), weights.items()):
+                told = {"weight": float(weight[i]), "return_so_far": so_far[i]}
+                named = {"weather": tasks[i].weather, "episode_seed": tasks[i].seed}
+                rows.append({**named, "t": t, "modality": modality, **told})
             actions, _ = model.predict(observations, deterministic=True)
             observations, rewards, dones, _ = env.step(actions)
-            so_far += float(rewards[0])
-            if dones[0]:
+            so_far += rewards
+            driving &= ~dones
+            if not driving.any():
                 break
     finally:
         env.close()
@@ -224,18 +229,26 @@ def weights_of_episode(job: Job, model: Any, task: Task) -> pd.DataFrame:
 
 def break_sensors(job: Job, model: OffPolicyAlgorithm, folder: Path, failures: Failures) -> None:
     """Each modality failing in each way for whole episodes, beside the healthy ones: ``failures.csv``."""
-    path = final_folder(job, folder) / "failures.csv"
-    for weather in job.grid.weathers:
-        for case in failure_cases(model, failures):
-            key = {"weather": weather, **case}
-            done = _rows_of(path, **key)
-            if len(done) and int(done["episodes"].iloc[0]) == failures.episodes:
-                continue
-            if case == HEALTHY:
-                episodes = _typed(_rows_of(path.with_name("episodes.csv"), weather=weather)).head(failures.episodes)
-            else:
-                episodes = _drive(job, model, weather, failures.episodes, case)
-            _replace(path, pd.DataFrame([{**case, **_summary(episodes).iloc[0]}]), key)
+    path, n_episodes = final_folder(job, folder) / "failures.csv", failures.episodes
+    missing = []
+    for weather, case in product(job.grid.weathers, failure_cases(model, failures)):
+        done = _rows_of(path, weather=weather, **case)
+        if not len(done) or int(done["episodes"].iloc[0]) != n_episodes:
+            missing.append((weather, case))
+    tasks: list[Task] = []
+    for weather, case in missing:
+        if case != HEALTHY:
+            wrapper = partial(_wrapped, config=job.config, failure=case)
+            tasks += episode_tasks([weather], n_episodes, FINAL_SEED, wrapper)
+    driven, rows = _drive(job, model, tasks) if tasks else pd.DataFrame(), []
+    for weather, case in missing:
+        if case == HEALTHY:
+            episodes = _typed(_rows_of(path.with_name("episodes.csv"), weather=weather)).head(n_episodes)
+        else:
+            episodes, driven = driven.head(n_episodes), driven.iloc[n_episodes:]
+        rows.append({**case, **_summary(episodes).iloc[0]})
+    if missing:
+        _replace(path, pd.DataFrame(rows), [{"weather": weather, **case} for weather, case in missing])
 
 
 def failure_cases(model: OffPolicyAlgorithm, failures: Failures) -> list[dict[str, Any]]:
@@ -317,11 +330,13 @@ def _matches(rows: pd.DataFrame, key: dict[str, Any]) -> pd.Series[bool]:
     return matches
 
 
-def _replace(path: Path, rows: pd.DataFrame, key: dict[str, Any]) -> None:
-    """Put rows in place of those with the given values."""
+def _replace(path: Path, rows: pd.DataFrame, keys: Sequence[dict[str, Any]]) -> None:
+    """Put rows in place of those with the values of one of the keys."""
     if path.exists():
         old = read_text_table(path)
-        rows = pd.concat([old[~_matches(old, key)], rows])
+        for key in keys:
+            old = old[~_matches(old, key)]
+        rows = pd.concat([old, rows])
     write_atomically(path, partial(rows.to_csv, index=False))
 
 

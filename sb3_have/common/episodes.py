@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import multiprocessing
 import signal
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple, Protocol
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecTransposeImage
-from tqdm import tqdm
 
 
 class Predictor(Protocol):
@@ -27,56 +27,52 @@ class Predictor(Protocol):
 
 
 class Task(NamedTuple):
-    """One episode to drive."""
+    """One episode to drive.
+
+    :param weather: of the episode
+    :param seed: of the episode
+    :param env_wrapper: applied to its environment; the same object for tasks that may share one
+    """
 
     weather: str
     seed: int
+    env_wrapper: Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] | None = None
 
 
 class EpisodeQueue(gym.Env[Any, Any]):
-    """Given episodes one after the other; ``reset`` moves on to the next. It idles at no cost when all are over.
+    """Given episodes one after the other; ``reset`` takes the next one. It idles at no cost when none is left.
 
-    :param env_id: of the environment, made anew when the weather changes
-    :param tasks: weather and seed of each episode
+    :param env_id: of the environment, made again when weather or wrapper change
+    :param tasks: the episodes with their numbers; several environments of one process may share a queue
     :param env_kwargs: further keywords for ``gym.make``
-    :param env_wrapper: applied to each environment that is made
     """
 
-    def __init__(
-        self,
-        env_id: str,
-        tasks: Sequence[Task],
-        env_kwargs: Mapping[str, Any],
-        env_wrapper: Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] | None = None,
-    ) -> None:
+    def __init__(self, env_id: str, tasks: deque[tuple[int, Task]], env_kwargs: Mapping[str, Any]) -> None:
         leave_interrupts_to_parent()
-        self._env: gym.Env[Any, Any]
-        self._env_wrapper = env_wrapper
-        self._env_id, self._tasks, self._env_kwargs = env_id, list(tasks), dict(env_kwargs)
-        self._next, self._weather = 0, ""
-        self._make(self._tasks[0].weather)
+        self._env_id, self._tasks, self._env_kwargs = env_id, tasks, dict(env_kwargs)
+        self._env = self._make(tasks[0][1])
+        self.number: int | None = None
+        """Of the episode that is driven; None when none is left."""
         self.observation_space, self.action_space = self._env.observation_space, self._env.action_space
         self.render_mode, self.metadata = self._env.render_mode, self._env.metadata
 
-    def _make(self, weather: str) -> None:
-        if weather != self._weather:
-            if self._weather:
-                self._env.close()
-            env: gym.Env[Any, Any] = gym.make(self._env_id, weather=weather, **self._env_kwargs)
-            self._env = env if self._env_wrapper is None else self._env_wrapper(env)
-            self._weather = weather
+    def _make(self, task: Task) -> gym.Env[Any, Any]:
+        self._made_for = task
+        env: gym.Env[Any, Any] = gym.make(self._env_id, weather=task.weather, **self._env_kwargs)
+        return env if task.env_wrapper is None else task.env_wrapper(env)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        self._idle = self._next == len(self._tasks)
-        if not self._idle:
-            task = self._tasks[self._next]
-            self._make(task.weather)
+        self.number = None
+        if self._tasks:
+            self.number, task = self._tasks.popleft()
+            if task._replace(seed=self._made_for.seed) != self._made_for:
+                self._env.close()
+                self._env = self._make(task)
             self.observation, self._info = self._env.reset(seed=task.seed)
-            self._next += 1
         return self.observation, self._info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        if self._idle:
+        if self.number is None:
             return self.observation, 0.0, False, False, self._info
         self.observation, reward, terminated, truncated, info = self._env.step(action)
         return self.observation, float(reward), terminated, truncated, info
@@ -94,40 +90,49 @@ def leave_interrupts_to_parent() -> None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def drive(
-    model: Predictor, vec_env: VecEnv, quotas: list[int], deterministic: bool, bar: tqdm[Any]
-) -> list[list[dict[str, Any]]]:
-    """Drive episodes, one after the other in each environment.
+def drive(model: Predictor, vec_env: VecEnv, deterministic: bool = True) -> Iterator[tuple[int, dict[str, Any]]]:
+    """Drive the episodes of :class:`EpisodeQueue` environments, all environments by one ``predict``.
+
+    Environments with an empty queue are left out of the batch, unless the model returns a recurrent ``state``, which
+    has a row for every environment.
 
     :param model: reads the observations; rule-based drivers are shown every ``info`` by ``read_infos``
     :param vec_env: of n environments
-    :param quotas: how many episodes of each environment count, (n,)
     :param deterministic: whether the policy's mode is driven rather than a sample of it
-    :param bar: moved on after each episode
-    :return: the episodes of each environment in order, as many as its quota: ``return, steps, distance, crashed,
-        offroad``; what the environment's ``info`` does not tell is NaN
+    :return: the number of each episode as it ends, and ``return, steps, distance, crashed, offroad``; what the
+        environment's ``info`` does not tell is NaN
     """
-    episodes: list[list[dict[str, Any]]] = [[] for _ in quotas]
-    returns, steps = np.zeros(len(quotas)), np.zeros(len(quotas), dtype=int)
     observations = vec_env.reset()
     infos: list[dict[str, Any]] = list(vec_env.unwrapped.reset_infos)
-    state, starts = None, np.ones(len(quotas), dtype=bool)
-    while any(len(done) < quota for done, quota in zip(episodes, quotas, strict=True)):
+    numbers: list[int | None] = vec_env.get_attr("number")
+    returns, steps = np.zeros(len(numbers)), np.zeros(len(numbers), dtype=int)
+    actions = np.zeros((len(numbers), *(vec_env.action_space.shape or ())), vec_env.action_space.dtype)
+    state, starts = None, np.ones(len(numbers), dtype=bool)
+    while any(number is not None for number in numbers):
+        rows = [i for i, number in enumerate(numbers) if number is not None or state is not None]
         if hasattr(model, "read_infos"):
-            model.read_infos(infos)
-        actions, state = model.predict(observations, state=state, episode_start=starts, deterministic=deterministic)
+            model.read_infos([infos[i] for i in rows])
+        actions[rows], state = model.predict(
+            _rows_of(observations, rows), state=state, episode_start=starts[rows], deterministic=deterministic
+        )
         observations, rewards, starts, step_infos = vec_env.step(actions)
         returns += rewards
         steps += 1
-        # after the end of an episode the newest info is that of the reset
-        infos = [vec_env.unwrapped.reset_infos[i] if done else step_infos[i] for i, done in enumerate(starts)]
-        for i in np.flatnonzero(starts):
-            if len(episodes[i]) < quotas[i]:
-                told = {key: float(step_infos[i].get(key, np.nan)) for key in ("distance", "crashed", "offroad")}
-                episodes[i].append({"return": returns[i], "steps": int(steps[i]), **told})
-                bar.update()
+        infos = list(step_infos)
+        for i, number in enumerate(numbers):
+            if number is None or not starts[i]:
+                continue
+            told = {key: float(infos[i].get(key, np.nan)) for key in ("distance", "crashed", "offroad")}
+            yield number, {"return": returns[i], "steps": int(steps[i]), **told}
             returns[i], steps[i] = 0.0, 0
-    return episodes
+            # the newest info and number are those of the next episode, which the reset began
+            infos[i], numbers[i] = vec_env.unwrapped.reset_infos[i], vec_env.get_attr("number", indices=i)[0]
+
+
+def _rows_of(observations: Any, rows: list[int]) -> Any:
+    if isinstance(observations, dict):
+        return {key: part[rows] for key, part in observations.items()}
+    return observations[rows]
 
 
 def match_observations(vec_env: VecEnv, model: Any) -> VecEnv:

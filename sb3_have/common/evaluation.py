@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import zlib
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -29,6 +30,7 @@ def evaluate(
     deterministic: bool = True,
     progress_bar: bool = False,
     env_wrapper: Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] | None = None,
+    vec_env_cls: type[DummyVecEnv] | type[SubprocVecEnv] = DummyVecEnv,
 ) -> pd.DataFrame:
     """Return and distance of a driver in each weather.
 
@@ -37,21 +39,32 @@ def evaluate(
     :param env_id: of a registered environment that takes the keyword ``weather``
     :param weathers: names of the weathers
     :param n_episodes: episodes in each weather
-    :param seed: of the episodes; the same seed gives every driver the same episodes, whatever
-        ``n_envs`` is
+    :param seed: of the episodes; the same seed gives every driver the same episodes, whatever ``n_envs`` is. A forward
+        pass rounds differently in batches of different sizes, by 1e-7 of an action, which may grow over an episode
     :param env_kwargs: further keywords for ``gym.make``, the same as in training
-    :param n_envs: environments at a time, each in a process of its own when there are several
+    :param n_envs: environments at a time, with one ``predict`` for all of them
     :param deterministic: whether the policy's mode is driven rather than a sample of it
     :param progress_bar: shown per episode, within a training below that of SB3's ``learn``
     :param env_wrapper: applied to every environment, e.g. ``partial(SensorFailure, modality="rgb", kind="black",
-        severity=3)``; a function or class that can be pickled if there are several environments
+        severity=3)``; a function or class that can be pickled if ``vec_env_cls`` is ``SubprocVecEnv``
+    :param vec_env_cls: ``SubprocVecEnv`` steps each environment in a process of its own
     :return: a row per weather: ``weather, episodes, return_mean, return_std, distance_mean, distance_std`` [m],
         ``steps_mean, crash_share, offroad_share`` (0..1). Standard deviations are over episodes (ddof=0, as SB3's);
         what the environment's ``info`` does not tell (``distance, crashed, offroad``) is NaN
     :raises ValueError: if the model's observation space cannot be made from the environment's, or counts are < 1
     """
     episodes = evaluate_episodes(
-        model, env_id, weathers, n_episodes, seed, env_kwargs, n_envs, deterministic, progress_bar, env_wrapper
+        model,
+        env_id,
+        weathers,
+        n_episodes,
+        seed,
+        env_kwargs,
+        n_envs,
+        deterministic,
+        progress_bar,
+        env_wrapper,
+        vec_env_cls,
     )
     return summarize(episodes)
 
@@ -67,38 +80,69 @@ def evaluate_episodes(
     deterministic: bool = True,
     progress_bar: bool = False,
     env_wrapper: Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] | None = None,
+    vec_env_cls: type[DummyVecEnv] | type[SubprocVecEnv] = DummyVecEnv,
 ) -> pd.DataFrame:
     """The single episodes behind :func:`evaluate`, which has the same parameters.
 
     :return: a row per episode: ``weather, seed, return, distance, steps, crashed, offroad``
     """
-    if n_episodes < 1 or n_envs < 1 or not weathers:
-        raise ValueError(f"need n_episodes, n_envs >= 1 and a weather, got {n_episodes}, {n_envs}, {list(weathers)}")
+    tasks = episode_tasks(weathers, n_episodes, seed, env_wrapper)
+    episodes = drive_tasks(model, env_id, tasks, env_kwargs, n_envs, deterministic, progress_bar, vec_env_cls)
+    order = {weather: i for i, weather in enumerate(weathers)}
+    return episodes.sort_values("weather", key=lambda names: names.map(order), kind="stable", ignore_index=True)
+
+
+def episode_tasks(
+    weathers: Sequence[str],
+    n_episodes: int,
+    seed: int,
+    env_wrapper: Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] | None = None,
+) -> list[Task]:
+    """The episodes of :func:`evaluate_episodes`, which has the same parameters; weathers vary fastest."""
+    if n_episodes < 1 or not weathers:
+        raise ValueError(f"need n_episodes >= 1 and a weather, got {n_episodes} and {list(weathers)}")
     # Every weather has traffic of its own, the same for every driver: more situations for the same number of episodes.
     seeds = {w: np.random.SeedSequence([seed, zlib.crc32(w.encode())]).generate_state(n_episodes) for w in weathers}
-    # Weathers vary fastest, so that the shares of the environments are alike.
-    tasks = [Task(weather, int(seeds[weather][i])) for i in range(n_episodes) for weather in weathers]
+    return [Task(weather, int(seeds[weather][i]), env_wrapper) for i in range(n_episodes) for weather in weathers]
+
+
+def drive_tasks(
+    model: Predictor,
+    env_id: str,
+    tasks: Sequence[Task],
+    env_kwargs: Mapping[str, Any] | None = None,
+    n_envs: int = 1,
+    deterministic: bool = True,
+    progress_bar: bool = False,
+    vec_env_cls: type[DummyVecEnv] | type[SubprocVecEnv] = DummyVecEnv,
+) -> pd.DataFrame:
+    """Any episodes, driven as by :func:`evaluate`, which has the same parameters.
+
+    :param tasks: the episodes
+    :return: as :func:`evaluate_episodes`, in the order of ``tasks``
+    """
+    if n_envs < 1:
+        raise ValueError(f"need n_envs >= 1, got {n_envs}")
     n_envs = min(n_envs, len(tasks))
-    # A fixed share for each environment: taking whatever ends first would favour short episodes.
-    shares = [tasks[i::n_envs] for i in range(n_envs)]
-    makers = [partial(EpisodeQueue, env_id, share, dict(env_kwargs or {}), env_wrapper) for share in shares]
-    vec_env: VecEnv = SubprocVecEnv(makers) if n_envs > 1 else DummyVecEnv(makers)  # type: ignore[arg-type]
+    # All tasks are driven to their end, so it does not matter which environment drives which. Environments of one
+    # process share a queue, and none waits while there is something left; processes have fixed shares.
+    numbered = list(enumerate(tasks))
+    shares = [numbered] if vec_env_cls is DummyVecEnv else [numbered[i::n_envs] for i in range(n_envs)]
+    queues = [deque(share) for share in shares] * (n_envs // len(shares))
+    makers: list[Any] = [partial(EpisodeQueue, env_id, queue, dict(env_kwargs or {})) for queue in queues]
+    vec_env: VecEnv = vec_env_cls(makers)
+    done: dict[int, dict[str, Any]] = {}
     try:
         vec_env = match_observations(vec_env, model)
         # SB3's bar is drawn by rich, which swallows what others write to stderr as long as it is there
         below = getattr(sys.stderr, "rich_proxied_file", None)
         with tqdm(total=len(tasks), unit="episode", disable=not progress_bar, file=below, leave=below is None) as bar:
-            done_by_env = drive(model, vec_env, [len(share) for share in shares], deterministic, bar)
+            for number, episode in drive(model, vec_env, deterministic):
+                done[number] = episode
+                bar.update()
     finally:
         vec_env.close()
-    rows = [
-        {"weather": task.weather, "seed": task.seed, **episode}
-        for share, episodes in zip(shares, done_by_env, strict=True)
-        for task, episode in zip(share, episodes, strict=True)
-    ]
-    order = {weather: i for i, weather in enumerate(weathers)}
-    rows.sort(key=lambda row: order[row["weather"]])
-    return pd.DataFrame(rows)
+    return pd.DataFrame([{"weather": task.weather, "seed": task.seed, **done[number]} for number, task in numbered])
 
 
 def summarize(episodes: pd.DataFrame) -> pd.DataFrame:
