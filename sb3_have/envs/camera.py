@@ -10,7 +10,7 @@ Camera frame: forward, right, metres. Image: u to the right, v down, in pixels; 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Final
 
 import cv2
@@ -21,12 +21,14 @@ from sb3_have.envs.ground import Ground, GroundView
 from sb3_have.envs.road_shape import RoadShape
 from sb3_have.envs.scene import (
     BODY,
+    BOTTOM,
     FRONT,
     FRONT_LIT,
     RAIL_PIECE,
     TEXTURE_COLUMNS,
     TEXTURE_ROWS,
     TEXTURES,
+    TOP,
     TREE,
     WORLD_PERIOD,
     Array,
@@ -109,12 +111,13 @@ class Camera:
         :param sizes: (1 + vehicles, 2): length and width in metres.
         """
         faces = self._project(poses, sizes)
+        side = SUPERSAMPLING * self.size
         painted = self._paint(len(poses), faces).reshape(-1)
         sample = np.flatnonzero(painted != 0)
         face = painted[sample].astype(np.int64) - 1
         # Line: row of the images stacked. (numpy divides by a constant much faster than it takes a remainder.)
-        line = sample.astype(np.int32) // (SUPERSAMPLING * self.size)
-        column = sample - SUPERSAMPLING * self.size * line
+        line = sample.astype(np.int32) // side
+        column = sample - side * line
         pixel = line // SUPERSAMPLING * self.size + column // SUPERSAMPLING
 
         # Inverse depth, and s over depth, are linear along an image row.
@@ -122,7 +125,7 @@ class Camera:
         q = np.clip((self._sample_u[column] - u0) * per_pixel, 0, 1)
         depth = 1 / (inverse + q * inverse_change)
         cell_s = np.floor(TEXTURE_COLUMNS * np.minimum((s + q * s_change) * depth, s_max)).astype(np.int32)
-        z = np.float32(self.height) - np.tile(self._sample_slope, len(poses))[line] * depth
+        z = np.float32(self.height) - self._sample_slope.take(line, mode="wrap") * depth
         cell_z = np.clip((z - bottom) * cells, 0, TEXTURE_ROWS - 1).astype(np.int32)
         cell = (faces.kind.take(face) * TEXTURE_ROWS + cell_z) * TEXTURE_COLUMNS + cell_s % TEXTURE_COLUMNS
         material = TEXTURES.take(cell)
@@ -146,7 +149,7 @@ class Camera:
 
     def _pose(self, poses: Array, period: float = np.inf) -> tuple[Array, Array, Array]:
         """Position x (modulo a period), y and heading of the camera, (instants,) each."""
-        x, y, heading = np.moveaxis(poses[:, 0], -1, 0)
+        x, y, heading = poses[:, 0].T
         x = x + self.offset * np.cos(heading)
         return x if period == np.inf else x % period, y + self.offset * np.sin(heading), heading
 
@@ -154,53 +157,72 @@ class Camera:
         """The faces that the camera sees, far to near in each instant."""
         x, y, heading = self._pose(poses)
         traffic = poses[:, 1:]
-        forward, right = np.moveaxis(_to_camera(traffic[..., :2], x, y, heading), -1, 0)
+        forward, right = _to_camera(traffic[..., :2], x, y, heading)
+        distance = np.hypot(forward, right)
         in_view = (forward > -5) & (forward < FAR + 5) & (np.abs(right) < 0.6 * forward + 12)
         shown = np.flatnonzero(in_view.any(axis=0))
-        order = shown[np.argsort(-np.hypot(forward[:, shown], right[:, shown]), axis=1, kind="stable")]
+        order = shown[np.argsort(-distance[:, shown], axis=1, kind="stable")]
         faces = Faces.concatenate(*self.roadside.faces(x, FAR), vehicle_faces(traffic, sizes[1:], order, self._front))
 
-        start, end = _to_camera(faces.start, x, y, heading), _to_camera(faces.end, x, y, heading)
+        # Both ends of the faces in the camera frame: (start and end, instants, faces).
+        forward, right = _to_camera(np.stack((faces.start, faces.end)), x, y, heading)
         # Turned towards the camera: the start lies to the left of the end.
-        seen = start[..., 0] * end[..., 1] > start[..., 1] * end[..., 0]
-        seen &= np.maximum(start[..., 0], end[..., 0]) > 2 * NEAR
-        # A vehicle is shown at the instants at which it is in view; number -1, the roadside, at all.
+        seen = forward[0] * right[1] > right[0] * forward[1]
+        seen &= np.maximum(forward[0], forward[1]) > 2 * NEAR
+        # A vehicle is shown at the instants at which it is in view, the roadside at all.
         every = np.arange(len(poses))[:, None]
-        seen &= np.concatenate((in_view, every >= 0), axis=1)[every, faces.vehicle]
-        instant, face = np.nonzero(seen)
+        seen[:, seen.shape[1] - 4 * len(shown) :] &= in_view[every, order].repeat(4, axis=1)
+        face = np.flatnonzero(seen)
         if not self.shape.plain:
-            # A road that bends or forks has its roadside before vehicles as well as behind them.
-            away = np.maximum(np.hypot(*start[instant, face].T), np.hypot(*end[instant, face].T))
-            vehicle = faces.vehicle[instant, face]
-            middle = np.concatenate((np.hypot(forward, right), 0.0 * every), axis=1)
-            away = np.where(vehicle < 0, away, middle[instant, vehicle])
-            # A piece of rail counts by its farther end: all that stands behind rails is still farther.
-            place = np.concatenate((traffic[..., :2], np.zeros((len(poses), 1, 2))), axis=1)[instant, vehicle]
-            place = np.where(vehicle[:, None] < 0, 0.5 * (faces.start + faces.end)[instant, face], place)
-            away += RAIL_PIECE * (self.roadside.behind_rail(place) + (faces.kind[instant, face] == TREE))
-            order = np.argsort(-away, kind="stable")
-            instant, face = instant[order], face[order]
-        start, end = start[instant, face], end[instant, face]
-        faces = Faces(*(getattr(faces, field.name)[instant, face] for field in fields(Faces)))
-        start, s_start = _clip_near(start, end, faces.s_start, faces.s_end)
-        end, s_end = _clip_near(end, start, faces.s_end, s_start)
+            far = self._remoteness(faces, face, np.hypot(forward, right), distance, traffic[..., 1])
+            face = face[np.argsort(-far, kind="stable")]
+        forward, right = (value.reshape(2, -1).take(face, axis=1) for value in (forward, right))
+        instant, faces = face // seen.shape[1], faces.take(face)
+        # (start and end; forward, right, place on the texture; faces)
+        ends = np.stack((forward, right, (faces.s_start, faces.s_end)), axis=1)
+        _clip_near(*ends)
+        _clip_near(*ends[::-1])
 
-        inverse0, inverse1 = 1 / start[:, 0], 1 / end[:, 0]
-        u0 = self.centre + self.focal * start[:, 1] * inverse0
-        u1 = self.centre + self.focal * end[:, 1] * inverse1
-        bottom, top = self.focal * (self.height - faces.bottom), self.focal * (self.height - faces.top)
-        v = self.centre + np.stack((bottom * inverse0, bottom * inverse1, top * inverse1, top * inverse0), axis=-1)
-        tip = np.where(faces.kind == TREE, 0.5, 0.0) * (u1 - u0)
-        u = np.stack((u0, u1, u1 - tip, u0 + tip), axis=-1)
-        s0, s1 = s_start * inverse0, s_end * inverse1
+        inverse = 1 / ends[:, 0]
+        u, s = self.centre + self.focal * ends[:, 1] * inverse, ends[:, 2] * inverse
+        bottom, top = BOTTOM.take(faces.kind), TOP.take(faces.kind)
+        width = u[1] - u[0]
+        tip = np.where(faces.kind == TREE, 0.5, 0.0) * width
+        corners = np.empty((len(face), 4, 2))
+        corners[:, :2, 0] = u.T
+        corners[:, 2, 0], corners[:, 3, 0] = u[1] - tip, u[0] + tip
+        corners[:, :2, 1] = (self.centre + self.focal * (self.height - bottom) * inverse).T
+        corners[:, 3:1:-1, 1] = (self.centre + self.focal * (self.height - top) * inverse).T
         # Just under the end of the texture, so that a sample on a face's edge falls into the last cell.
         s_max = np.maximum(faces.s_start, faces.s_end) - 1e-4
-        cells = TEXTURE_ROWS / (faces.top - faces.bottom)
-        per_pixel = 1 / np.maximum(u1 - u0, 1e-6)
+        cells = TEXTURE_ROWS / (top - bottom)
+        per_pixel = 1 / np.maximum(width, 1e-6)
         plane = np.array(
-            (u0, per_pixel, inverse0, inverse1 - inverse0, s0, s1 - s0, s_max, faces.bottom, cells), dtype=np.float32
+            (u[0], per_pixel, inverse[0], inverse[1] - inverse[0], s[0], s[1] - s[0], s_max, bottom, cells),
+            dtype=np.float32,
         )
-        return _Projected(instant, np.stack((u, v), axis=-1), plane, faces.kind, faces.normal, faces.vehicle)
+        return _Projected(instant, corners, plane, faces.kind, faces.normal, faces.vehicle)
+
+    def _remoteness(self, faces: Faces, face: IntArray, ends: Array, middles: Array, y: Array) -> Array:
+        """
+        The order of faces on a road that bends or forks, which has its roadside before vehicles as well as behind them.
+
+        :param faces: All faces.
+        :param face: Those to sort, indices into the flattened arrays.
+        :param ends: Distance of both ends of all faces, (2, instants, faces).
+        :param middles: Distance of the vehicles' middles, (instants, vehicles).
+        :param y: The same of their places.
+        :return: Metres; what stands behind rails counts as farther away than it is.
+        """
+        # A piece of rail counts by its farther end: all that stands behind rails is still farther.
+        far = np.maximum(ends[0], ends[1]).take(face)
+        place = 0.5 * (faces.start[..., 1].take(face) + faces.end[..., 1].take(face))
+        vehicle = faces.vehicle.take(face)
+        of_vehicle = np.flatnonzero(vehicle >= 0)
+        shown = face[of_vehicle] // ends.shape[2], vehicle[of_vehicle]
+        far[of_vehicle], place[of_vehicle] = middles[shown], y[shown]
+        far += RAIL_PIECE * (self.roadside.behind_rail(place) + (faces.kind.take(face) == TREE))
+        return np.asarray(far)
 
     def _paint(self, instants: int, faces: _Projected) -> NDArray[np.int32]:
         """Number of the face (from 1) that each sample sees, (instants, rows, columns) of samples; 0 for none."""
@@ -228,15 +250,20 @@ class _Projected:
     vehicle: IntArray
 
 
-def _to_camera(points: Array, x: Array, y: Array, heading: Array) -> Array:
-    """World points (instants, n, 2) in the camera frame: forward, right."""
+def _to_camera(points: Array, x: Array, y: Array, heading: Array) -> tuple[Array, Array]:
+    """World points (..., instants, n, 2) in the camera frame: forward and right, (..., instants, n) each."""
     dx, dy = points[..., 0] - x[:, None], points[..., 1] - y[:, None]
     cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
-    return np.stack((cos * dx + sin * dy, cos * dy - sin * dx), axis=-1)
+    return cos * dx + sin * dy, cos * dy - sin * dx
 
 
-def _clip_near(point: Array, other: Array, s: Array, s_other: Array) -> tuple[Array, Array]:
-    """Move the points that lie behind the near plane along their face onto it, and their s with them."""
-    behind = point[:, 0] < NEAR
-    share = np.where(behind, (NEAR - point[:, 0]) / np.where(behind, other[:, 0] - point[:, 0], 1), 0)
-    return point + share[:, None] * (other - point), s + share * (s_other - s)
+def _clip_near(point: Array, other: Array) -> None:
+    """
+    Move the points that lie behind the near plane along their face onto it.
+
+    :param point: Forward, right, place on the texture: (3, faces). Changed in place.
+    :param other: The other end of the faces.
+    """
+    behind = np.flatnonzero(point[0] < NEAR)
+    moved, towards = point[:, behind], other[:, behind] - point[:, behind]
+    point[:, behind] = moved + (NEAR - moved[0]) / towards[0] * towards

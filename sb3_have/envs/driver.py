@@ -22,6 +22,9 @@ from highway_env.vehicle.kinematics import Vehicle
 class Driver(IDMVehicle):
     """An ``IDMVehicle`` that knows its road to lead along x and to be longer than any drive."""
 
+    speed: float
+    impact: np.ndarray | None
+
     def act(self, action: Any = None) -> None:
         if self.crashed:
             return
@@ -75,7 +78,8 @@ class Driver(IDMVehicle):
         speed_ratio = max(ego_vehicle.speed, 0) / abs(not_zero(target_speed))
         acceleration = self.COMFORT_ACC_MAX * (1 - float(np.power(speed_ratio, self.DELTA)))
         if front_vehicle is not None:
-            distance = float(front_vehicle.position[0] - ego_vehicle.position[0])  # squared, so the direction does not matter
+            # Of either sign: it is squared.
+            distance = float(front_vehicle.position[0] - ego_vehicle.position[0])
             gap_ratio = self.desired_gap(ego_vehicle, front_vehicle) / not_zero(distance)
             acceleration -= self.COMFORT_ACC_MAX * float(np.power(gap_ratio, 2))
         return float(acceleration)
@@ -84,7 +88,8 @@ class Driver(IDMVehicle):
         if front_vehicle is None or not projected:
             return super().desired_gap(ego_vehicle, front_vehicle, projected)  # type: ignore[no-any-return]
         direction, velocity = self.road.motion(ego_vehicle)
-        speed, approach = float(ego_vehicle.speed), float(np.dot(velocity - self.road.motion(front_vehicle)[1], direction))
+        _, front_velocity = self.road.motion(front_vehicle)
+        speed, approach = float(ego_vehicle.speed), float(np.dot(velocity - front_velocity, direction))
         braking = 2 * math.sqrt(-self.COMFORT_ACC_MAX * self.COMFORT_ACC_MIN)
         return float(self.DISTANCE_WANTED + speed * self.TIME_WANTED + speed * approach / braking)
 

@@ -122,17 +122,23 @@ TEXTURES: Final = np.stack(
 )
 
 
+#: Heights of the lower and the upper edge of each kind of face.
+BOTTOM: Final = np.array((0.0, 0.0, 0.0, RAIL_BOTTOM, 0.0, 0.0))
+TOP: Final = np.array((*3 * (VEHICLE_HEIGHT,), RAIL_TOP, TREE_HEIGHT, VEHICLE_HEIGHT))
+
+
 @dataclass
 class Faces:
-    """Vertical rectangles, (instants, faces, ...) each. Seen from outside, ``start`` is their left end."""
+    """
+    Vertical rectangles, (instants, faces, ...) each. Seen from outside, ``start`` is their left end. How high they
+    stand depends on their kind, see :data:`BOTTOM` and :data:`TOP`.
+    """
 
     start: Array  # x, y
     end: Array
     normal: Array  # outward
     s_start: Array  # place on the texture, which repeats with period 1
     s_end: Array
-    bottom: Array
-    top: Array
     kind: IntArray
     vehicle: IntArray  # number of the traffic vehicle, or -1
 
@@ -140,6 +146,12 @@ class Faces:
     def concatenate(*parts: Faces) -> Faces:
         """All faces of the parts, in their order."""
         return Faces(*(np.concatenate([getattr(part, f.name) for part in parts], axis=1) for f in fields(Faces)))
+
+    def take(self, flat: IntArray) -> Faces:
+        """Some of the faces, by their index in the flattened arrays; the result has a single axis of faces."""
+        start, end, normal = (part.reshape(-1, 2).take(flat, axis=0) for part in (self.start, self.end, self.normal))
+        s_start, s_end = self.s_start.take(flat), self.s_end.take(flat)
+        return Faces(start, end, normal, s_start, s_end, self.kind.take(flat), self.vehicle.take(flat))
 
 
 class Roadside:
@@ -163,15 +175,15 @@ class Roadside:
         """
         return self._trees(x), self._rail(x, sight) if self.shape.plain else self._pieces(x, sight)
 
-    def behind_rail(self, points: Array) -> Array:
+    def behind_rail(self, y: Array) -> Array:
         """
-        How far points (..., 2) stand behind the road's own right rail, where a ramp is: 0 from the road to the rail, 1
+        How far what has this y stands behind the road's own right rail, where a ramp is: 0 from the road to the rail, 1
         from the ramp on, and between the two so gradually that who is farther along never comes to stand before others.
         """
         if not self.shape.ramps:
-            return np.zeros(points.shape[:-1])
+            return np.zeros(y.shape)
         rail = self.shape.middle + self.shape.half_width + RAIL_SETBACK
-        return np.asarray(np.clip((points[..., 1] - rail) / self.shape.lane_width, 0, 1))
+        return np.asarray(np.clip((y - rail) / self.shape.lane_width, 0, 1))
 
     def _trees(self, x: Array) -> Faces:
         # Every instant has the faces around its own x, so that it looks the same whichever others are rendered with it.
@@ -190,8 +202,6 @@ class Roadside:
             normal=one[..., None] * (-1.0, 0.0),
             s_start=0 * one,
             s_end=one,
-            bottom=0 * one,
-            top=TREE_HEIGHT * one,
             kind=np.full(one.shape, TREE),
             vehicle=np.full(one.shape, -1),
         )
@@ -233,7 +243,7 @@ class Roadside:
 
 def _steel(start: Array, end: Array, s_start: Array, s_end: Array) -> Faces:
     """Guard-rails."""
-    along, one = end - start, np.ones(start.shape[:2])
+    along = end - start
     length = np.maximum(np.hypot(along[..., 0], along[..., 1]), 1e-9)[..., None]
     return Faces(
         start=start,
@@ -241,10 +251,8 @@ def _steel(start: Array, end: Array, s_start: Array, s_end: Array) -> Faces:
         normal=np.stack((-along[..., 1], along[..., 0]), axis=-1) / length,
         s_start=s_start,
         s_end=s_end,
-        bottom=RAIL_BOTTOM * one,
-        top=RAIL_TOP * one,
-        kind=np.full(one.shape, RAIL),
-        vehicle=np.full(one.shape, -1),
+        kind=np.full(s_end.shape, RAIL),
+        vehicle=np.full(s_end.shape, -1),
     )
 
 
@@ -272,8 +280,6 @@ def vehicle_faces(poses: Array, sizes: Array, order: IntArray, front: int = FRON
         normal=np.stack((-ahead, aside, ahead, -aside), axis=2).reshape(*shape, 2),
         s_start=np.zeros(shape),
         s_end=np.ones(shape),
-        bottom=np.zeros(shape),
-        top=np.full(shape, VEHICLE_HEIGHT),
         kind=np.tile((REAR, SIDE, front, SIDE), (instants, count)),
         vehicle=np.repeat(order, 4, axis=1),
     )
