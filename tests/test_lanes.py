@@ -136,7 +136,7 @@ def test_occupants_of_lanes_of_another_width() -> None:
     x, car = 1000.0, env.vehicle
     y = 6.0 + float(shape.bend(x))
     for across, inside in [(0.0, True), (-3.9, True), (3.9, True), (4.1, False), (-4.1, False)]:
-        occupants = network.get_lane((*FORWARD, 1)).occupants([(x, y + across, car)])
+        occupants = network.get_lane((*FORWARD, 1)).occupants([(x, y + across, float(shape.bend(x)), car)])
         assert occupants == [(x, car)] * inside
         assert network.get_lane((*FORWARD, 1)).on_lane(np.array([x, y + across]), margin=1) == inside
 
@@ -148,7 +148,7 @@ def test_neighbours_are_those_of_the_stock_road(scenario: str) -> None:
     for seed in range(3):
         env.reset(seed=seed)
         road = env.road
-        road._placed = [(*v.position.tolist(), v) for v in road.vehicles]
+        road._placed = road._places()
         road._on_lane = {}
         for vehicle in road.vehicles:
             for direction, ends in road.network.graph.items():

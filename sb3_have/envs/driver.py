@@ -23,6 +23,8 @@ class Driver(IDMVehicle):
     """An ``IDMVehicle`` that knows its road to lead along x and to be longer than any drive."""
 
     speed: float
+    heading: float
+    crashed: bool
     impact: np.ndarray | None
 
     def act(self, action: Any = None) -> None:

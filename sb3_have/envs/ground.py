@@ -58,11 +58,13 @@ class GroundView:
         self.wide = forward / np.float32(focal)
         self.long = np.minimum(self.wide * forward / np.float32(height), np.float32(LONGEST))
         # The verge is a patchwork of random brightness, the same in every episode.
+        #: Patches of 1 m average out where they are smaller than a pixel: the share of their contrast that is left.
+        self.contrast = np.minimum(1, 2 / np.maximum(self.wide, self.long))
         self.patchwork = np.random.default_rng(0).uniform(0.55, 1.45, (64, 64)).astype(np.float32)
 
     def look(self, x: Array, y: Array, heading: Array) -> Ground:
         """
-        :param x: Of the camera at each instant, float32 (instants, 1, 1); likewise the others.
+        :param x: Of the camera at each instant, float32 (instants, 1, 1); the others too.
         :param y: In metres.
         :param heading: In radians.
         """
@@ -102,10 +104,8 @@ class GroundView:
             marking.reshape(-1)[opened] *= 1 - beside.take(opened) * gaps
             self._add_ramps(marking, road, along, across, sin, cos)
 
-        # Patches of 1 m average out where they are smaller than a pixel.
         patch = (np.floor(along).astype(np.int32) & 63) * 64 + (np.floor(across).astype(np.int32) & 63)
-        patches = self.patchwork.take(patch)
-        verge = 1 + (patches - 1) * np.minimum(1, 2 / np.maximum(self.wide, self.long))
+        verge = 1 + (self.patchwork.take(patch) - 1) * self.contrast
         return Ground(road, marking, verge)
 
     def _dashes(self, along: Array, dashed: IntArray, period: float) -> Array:

@@ -12,7 +12,7 @@ import numpy as np
 from highway_env.road.road import LaneIndex, RoadNetwork
 from highway_env.vehicle.kinematics import Vehicle
 
-from sb3_have.envs.road import ROAD_LENGTH, SPEED_LIMIT, AxisLane
+from sb3_have.envs.road import ROAD_LENGTH, SPEED_LIMIT, AxisLane, Placed
 from sb3_have.envs.road_shape import RoadShape
 
 FORWARD, ONCOMING = ("0", "1"), ("1", "0")
@@ -45,9 +45,9 @@ class BentLane(AxisLane):
         along = math.atan(self._slope(self._mirrored(longitudinal)))
         return along if self.sign > 0 else along + math.pi
 
-    def occupants(self, placed: list[tuple[float, float, Vehicle]]) -> list[tuple[float, Vehicle]]:
-        sign, centre, bend, reach = self.sign, self.centre, self.shape.bend, self.shape.lane_width / 2 + 1
-        return [(sign * x, vehicle) for x, y, vehicle in placed if abs(y - (centre + bend(x))) <= reach]
+    def occupants(self, placed: list[Placed]) -> list[tuple[float, Vehicle]]:
+        sign, centre, reach = self.sign, self.centre, self.shape.lane_width / 2 + 1
+        return [(sign * x, vehicle) for x, y, bend, vehicle in placed if abs(y - (centre + bend)) <= reach]
 
     def _mirrored(self, x: float) -> float:
         return x if self.sign > 0 else ROAD_LENGTH - x
@@ -79,9 +79,9 @@ class RampLane(BentLane):
         left, right = self.shape.ramp(x)
         return bool(self.shape.has_ramp(x)) and left - margin <= y <= right + margin
 
-    def occupants(self, placed: list[tuple[float, float, Vehicle]]) -> list[tuple[float, Vehicle]]:
+    def occupants(self, placed: list[Placed]) -> list[tuple[float, Vehicle]]:
         edge = self.shape.right_edge - 1
-        return [(x, v) for x, y, v in placed if y >= edge and self.on_lane(v.position, margin=1)]
+        return [(x, v) for x, y, _, v in placed if y >= edge and self.on_lane(v.position, margin=1)]
 
     def _y(self, x: float) -> float:
         return float(self.shape.ramp(x)[0]) + 0.5 * self.shape.lane_width
@@ -108,6 +108,10 @@ class ShapedNetwork(RoadNetwork):
         if shape.ramps:
             self.ramp = RampLane(shape)
             self.add_lane(*FORWARD, self.ramp)
+
+    def bend(self, x: float) -> float:
+        """How far the road lies to the right of the x axis [m]."""
+        return float(self.shape.bend(x))
 
     def get_closest_lane_index(self, position: np.ndarray, heading: float | None = None) -> LaneIndex:
         # By place alone: who drives on the wrong side is on the wrong side.

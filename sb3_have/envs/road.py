@@ -28,6 +28,10 @@ SPEED_LIMIT = 30.0
 """No traffic wants to be faster [m/s]; highway-env's default."""
 
 
+Placed = tuple[float, float, float, Vehicle]
+"""x [m], y [m], how far the road lies to the right of the x axis there [m], and the vehicle."""
+
+
 class AxisLane(StraightLane):
     """A straight lane along +x: its coordinates are differences, no dot product is needed."""
 
@@ -44,14 +48,10 @@ class AxisLane(StraightLane):
     def heading_at(self, longitudinal: float) -> float:
         return 0.0
 
-    def occupants(self, placed: list[tuple[float, float, Vehicle]]) -> list[tuple[float, Vehicle]]:
-        """
-        Who is on the lane or straddles its border, and how far along.
-
-        :param placed: x [m], y [m] and vehicle
-        """
+    def occupants(self, placed: list[Placed]) -> list[tuple[float, Vehicle]]:
+        """Who is on the lane or straddles its border, and how far along."""
         centre = self.centre
-        return [(x, vehicle) for x, y, vehicle in placed if abs(y - centre) <= LANE_WIDTH / 2 + 1]
+        return [(x, vehicle) for x, y, _, vehicle in placed if abs(y - centre) <= LANE_WIDTH / 2 + 1]
 
 
 class HighwayNetwork(RoadNetwork):
@@ -69,6 +69,10 @@ class HighwayNetwork(RoadNetwork):
             lane = AxisLane([0.0, y], [ROAD_LENGTH, y], line_types=(left, right), speed_limit=SPEED_LIMIT)
             self.add_lane("0", "1", lane)
 
+    def bend(self, x: float) -> float:
+        """How far the road lies to the right of the x axis [m]."""
+        return 0.0
+
     def get_closest_lane_index(self, position: np.ndarray, heading: float | None = None) -> LaneIndex:
         x, y = float(position[0]), float(position[1])
         beyond = max(x - ROAD_LENGTH, 0) + max(0 - x, 0)
@@ -80,18 +84,22 @@ class HighwayNetwork(RoadNetwork):
 class HighwayRoad(Road):
     """A :class:`~highway_env.road.road.Road` on lanes that lead along x, with cheap neighbours and collisions."""
 
-    _placed: list[tuple[float, float, Vehicle]] | None = None
+    _placed: list[Placed] | None = None
     _on_lane: dict[LaneIndex, list[tuple[float, Vehicle]]]
     _motions: dict[Vehicle, tuple[np.ndarray, np.ndarray]]
 
     def act(self) -> None:
         # Nobody moves while everybody decides: place each vehicle on each lane only once.
-        self._placed = [(*v.position.tolist(), v) for v in self.vehicles]
+        self._placed = self._places()
         self._on_lane, self._motions = {}, {}
         try:
             super().act()
         finally:
             self._placed = None
+
+    def _places(self) -> list[Placed]:
+        bend, places = self.network.bend, [v.position.tolist() for v in self.vehicles]
+        return [(x, y, bend(x), v) for (x, y), v in zip(places, self.vehicles, strict=True)]
 
     def neighbour_vehicles(
         self, vehicle: Vehicle, lane_index: LaneIndex | None = None
@@ -156,4 +164,4 @@ def _pass_by(one: Vehicle, other: Vehicle, dt: float) -> bool:
     slant = abs(math.sin(turn))
     half_widths = 0.5 * (one.WIDTH + slant * other.LENGTH + abs(math.cos(turn)) * other.WIDTH)
     # The one moves along its heading, not across it. The centimetre is far more than any rounding.
-    return gap > half_widths + abs(other.speed) * dt * slant + 0.01
+    return bool(gap > half_widths + abs(other.speed) * dt * slant + 0.01)

@@ -276,7 +276,7 @@ def vehicle_faces(poses: Array, sizes: Array, order: IntArray, front: int = FRON
     shape = (instants, 4 * count)
     return Faces(
         start=corners.reshape(*shape, 2),
-        end=np.roll(corners, -1, axis=2).reshape(*shape, 2),
+        end=corners[:, :, (1, 2, 3, 0)].reshape(*shape, 2),
         normal=np.stack((-ahead, aside, ahead, -aside), axis=2).reshape(*shape, 2),
         s_start=np.zeros(shape),
         s_end=np.ones(shape),

@@ -203,13 +203,14 @@ class Illumination:
 
         # Ground: light that falls on it, and the haze and the sky's mirror image that lie over it.
         forward = camera.ground_forward
-        self.haze = np.exp(-np.float32(weather.extinction) * forward)
+        haze = np.exp(-np.float32(weather.extinction) * forward)
+        self.fog = self.horizon[..., None] * (1 - haze)
         flat = self.ambient + self.sun * np.float32(SUN_DIRECTION[2])
         beam = self._beam(forward, camera.slope) * np.minimum(1, 6 / forward)
-        self.ground_light = (flat[..., None] + beam * self.beam[..., None]) * self.haze
+        self.ground_light = (flat[..., None] + beam * self.beam[..., None]) * haze
         grazing = camera.height / np.hypot(camera.height, forward)
         mirror = np.float32(weather.wetness) * (0.02 + 0.6 * (1 - grazing) ** 5)
-        self.mirror = self.horizon[..., None] * mirror * self.haze * np.float32(0.6)
+        self.mirror = self.horizon[..., None] * mirror * haze * np.float32(0.6)
 
     def _light(self, value: Array | Colour) -> Array:
         """Colour channels, or their brightness, along the first axis, which is as fast as numpy can loop: (C, n)."""
@@ -233,13 +234,11 @@ class Illumination:
         size, horizon = camera.size, camera.horizon
         image = np.empty((len(self.sky), len(ground.road), size, size), dtype=np.float32)
         image[:, :, :horizon] = self.sky[:, None]
-        asphalt, paint, verge, light = (
-            value[..., None, None] for value in (self.asphalt, self.marking, self.verge, self.horizon)
-        )
+        asphalt, paint, verge = (value[..., None, None] for value in (self.asphalt, self.marking, self.verge))
         surface = asphalt + ground.marking * (paint - asphalt)
         verge = ground.verge * verge
         below = (verge + ground.road * (surface - verge)) * self.ground_light[:, None]
-        below += ground.road * self.mirror[:, None] + light * (1 - self.haze)
+        below += ground.road * self.mirror[:, None] + self.fog[:, None]
         image[:, :, horizon:] = below
 
         share = np.float32(SUPERSAMPLING**-2)  # of a pixel that one sample covers

@@ -268,23 +268,23 @@ class EventCamera:
         gap = level - self._reference
         # The slack keeps pixels that sit on a threshold: the exact comparison below decides about them.
         pixel = np.flatnonzero((gap > self.thresholds[0] * (1 - 1e-9)) | (gap < self.thresholds[1] * (1e-9 - 1)))
-        gap, start, end, reference = gap[pixel], self._level[pixel], level[pixel], self._reference[pixel]
-        sign = np.sign(gap)
-        step = np.where(gap > 0, self.thresholds[0][pixel], self.thresholds[1][pixel]) * sign
+        gap = gap[pixel]
+        sign, step = np.sign(gap), np.where(gap > 0, *self.thresholds[:, pixel])
+        # From here on a fall is a rise, its levels negated, which loses no bit.
+        start, end, reference = sign * self._level[pixel], sign * level[pixel], sign * self._reference[pixel]
 
         # Division may be off by one at a boundary; the comparison that defines a crossing settles it.
-        count = np.floor(gap / step)
-        count += sign * (reference + (count + 1) * step) <= sign * end
-        count -= sign * (reference + count * step) > sign * end
+        count = np.floor(np.abs(gap) / step)
+        count += reference + (count + 1) * step <= end
+        count -= reference + count * step > end
         # The moved reference is rounded: it may leave a level that has come to rest on a threshold just beyond it.
-        fired = (count > 0) & (end != start)
-        pixel, start, end, reference = pixel[fired], start[fired], end[fired], reference[fired]
-        sign, step, repeats = sign[fired], step[fired], count[fired].astype(np.int64)
+        count *= (count > 0) & (end != start)
+        repeats = count.astype(np.int64)
+        self._reference[pixel] = sign * (reference + count * step)
 
         index = np.repeat(np.arange(len(pixel)), repeats)
         nth = np.arange(1, len(index) + 1) - (np.cumsum(repeats) - repeats)[index]
         times = t0 + (reference[index] + nth * step[index] - start[index]) / (end - start)[index] * (t1 - t0)
-        self._reference[pixel] = reference + repeats * step
         return pixel[index], np.clip(times, t0, t1), sign[index]
 
     def _shot_noise(self, t0: float, t1: float, rng: np.random.Generator) -> Events:
