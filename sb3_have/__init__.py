@@ -1,14 +1,23 @@
-"""Hierarchical adaptive value estimation (HAVE) for multi-modal agents, on Stable-Baselines3."""
+"""
+Hierarchical adaptive value estimation (HAVE) for multi-modal agents, on Stable-Baselines3.
 
+Importing the package registers its environments. Everything else is imported when it is first used, so that
+``import sb3_have`` takes no longer than ``import gymnasium``.
+"""
+
+from importlib import import_module
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from sb3_have import envs as envs  # registers the environments
-from sb3_have.common.buffers import ModalityReplayBuffer
-from sb3_have.common.checkpoint import ResumableCheckpointCallback, load_checkpoint, save_checkpoint
-from sb3_have.common.evaluation import evaluate
-from sb3_have.common.recording import Recording, record_episode
-from sb3_have.export import export_onnx, export_safetensors, load_policy
-from sb3_have.have import HAVESAC, DeepMDPCallback, ModalityWeightsCallback, MultiModalCritic, MultiModalPolicy
+
+if TYPE_CHECKING:
+    from sb3_have.common.buffers import ModalityReplayBuffer
+    from sb3_have.common.checkpoint import ResumableCheckpointCallback, load_checkpoint, save_checkpoint
+    from sb3_have.common.evaluation import evaluate
+    from sb3_have.common.recording import Recording, record_episode
+    from sb3_have.export import export_onnx, export_safetensors, load_policy
+    from sb3_have.have import HAVESAC, DeepMDPCallback, ModalityWeightsCallback, MultiModalCritic, MultiModalPolicy
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 
@@ -30,3 +39,38 @@ __all__ = [
     "record_episode",
     "save_checkpoint",
 ]
+
+_MODULES = {
+    "HAVESAC": "have",
+    "DeepMDPCallback": "have",
+    "ModalityReplayBuffer": "common.buffers",
+    "ModalityWeightsCallback": "have",
+    "MultiModalCritic": "have",
+    "MultiModalPolicy": "have",
+    "Recording": "common.recording",
+    "ResumableCheckpointCallback": "common.checkpoint",
+    "evaluate": "common.evaluation",
+    "export_onnx": "export",
+    "export_safetensors": "export",
+    "load_checkpoint": "common.checkpoint",
+    "load_policy": "export",
+    "record_episode": "common.recording",
+    "save_checkpoint": "common.checkpoint",
+}
+_PACKAGES = ("common", "export", "have", "plotting", "sensors")
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name, or one of the packages inside, on first use (PEP 562)."""
+    if name in _MODULES:
+        value = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    elif name in _PACKAGES:
+        value = import_module(f"{__name__}.{name}")
+    else:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__, *_PACKAGES})

@@ -360,7 +360,6 @@ def has_avx512() -> bool:
     return th.backends.cpu.get_cpu_capability() == "AVX512"
 
 
-@th.compiler.assume_constant_result  # type: ignore[untyped-decorator]
 def has_native_bfloat16(device_type: str) -> bool:
     """Whether the hardware multiplies bfloat16 matrices natively: a CPU with AMX, or CUDA from sm80 on."""
     if device_type == "cuda":

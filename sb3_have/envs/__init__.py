@@ -1,12 +1,17 @@
 """Environments; importing this package registers them: HighwayVision-v0, CarlaVision-v0 and ReliabilityDrive-v0."""
 
+from typing import TYPE_CHECKING, Any
+
 from gymnasium.envs.registration import WrapperSpec, register, registry
 
-from sb3_have.envs.highway_vision import HighwayVisionEnv
-from sb3_have.envs.reliability_drive import ReliabilityDriveEnv
+if TYPE_CHECKING:
+    from sb3_have.envs.highway_vision import HighwayVisionEnv
+    from sb3_have.envs.reliability_drive import ReliabilityDriveEnv
 
 __all__ = ["HighwayVisionEnv", "ReliabilityDriveEnv"]
 
+# The entry points are given by name, so that highway-env is imported when an environment is made, and the package
+# carla, an extra, only for CarlaVision-v0
 if "HighwayVision-v0" not in registry:
     register(
         id="HighwayVision-v0",
@@ -19,7 +24,7 @@ if "HighwayVision-v0" not in registry:
 if "CarlaVision-v0" not in registry:
     register(
         id="CarlaVision-v0",
-        entry_point="sb3_have.envs.carla_vision:CarlaVisionEnv",  # by name: the package carla is an extra
+        entry_point="sb3_have.envs.carla_vision:CarlaVisionEnv",
         max_episode_steps=500,
         kwargs={"max_episode_steps": None},
         additional_wrappers=(WrapperSpec("ReportTimeout", "sb3_have.envs.highway_vision:ReportTimeout", {}),),
@@ -27,3 +32,20 @@ if "CarlaVision-v0" not in registry:
 
 if "ReliabilityDrive-v0" not in registry:
     register(id="ReliabilityDrive-v0", entry_point="sb3_have.envs.reliability_drive:ReliabilityDriveEnv")
+
+
+def __getattr__(name: str) -> Any:
+    """Import an environment class on first use (PEP 562)."""
+    if name == "HighwayVisionEnv":
+        from sb3_have.envs.highway_vision import HighwayVisionEnv
+
+        return HighwayVisionEnv
+    if name == "ReliabilityDriveEnv":
+        from sb3_have.envs.reliability_drive import ReliabilityDriveEnv
+
+        return ReliabilityDriveEnv
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -7,19 +7,19 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Image, TensorBoardOutputFormat
 
 from sb3_have.common.checkpoint import same_random_numbers
 from sb3_have.common.files import write_atomically
 from sb3_have.common.recording import record_episode, weighing
-from sb3_have.plotting.episode import plot_modality_weights
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 NOT_TEXT = ("stdout", "log", "json", "csv")
 """Outputs of SB3's logger that take no histograms and images."""
@@ -149,6 +149,8 @@ class ModalityWeightsCallback(BaseCallback):
         return step // self.episode_freq > (step - n_envs) // self.episode_freq
 
     def _log_episode(self) -> None:
+        from sb3_have.plotting.episode import plot_modality_weights  # matplotlib takes a second to import
+
         assert self.eval_env is not None
         with same_random_numbers():
             recording = self._record(self.model, self.eval_env)
@@ -164,6 +166,8 @@ class ModalityWeightsCallback(BaseCallback):
 
 def _pixels(figure: Figure) -> np.ndarray:
     """uint8 (H, W, 3); not SB3's ``Figure``, which draws by pyplot."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     canvas = FigureCanvasAgg(figure)
     canvas.draw()  # type: ignore[no-untyped-call]
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
