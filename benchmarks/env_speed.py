@@ -4,11 +4,12 @@
 
 20 vehicles, the ego keeps straight at about 15 m/s; a step is 0.1 s or, as by default, 0.2 s of simulation at 20 Hz.
 The contenders take turns in one process; those with the same traffic drive through the very same one, see
-``benchmarks/road_identity.py``. Episodes end and begin anew within the time that is measured. Rows, printed and written
-to benchmarks/results/env_speed.csv:
+``benchmarks/road_identity.py``. The time measured includes the resets between episodes. Rows, printed and written to
+benchmarks/results/env_speed.csv:
 
 - ``HighwayVision-v0``: for image sizes, weathers and modalities;
-- ``HighwayVision-v0, driven``: its scenarios, with an IDM/MOBIL driver at the wheel, who follows the bends;
+- ``HighwayVision-v0, driven``: its scenarios, with an IDM/MOBIL driver at the wheel, who follows the bends; and the
+  benchmark's task, "curves" seen through the colour and the event camera, for all weathers asked for;
 - ``no sensors``: its dynamics alone; ``stock road, no sensors``: the same on highway-env's own road, with its drivers;
 - ``highway-v0``: highway-env's environment with continuous actions and its default observation, 5 vehicles in numbers.
 
@@ -128,6 +129,7 @@ def main() -> None:
     ]
     contenders += [Contender("HighwayVision-v0", 84, "ClearNoon", (name,), "highway") for name in ALL]
     contenders += [Contender(DRIVEN, 64, "ClearNoon", ALL, scenario) for scenario in SCENARIOS]
+    contenders += [Contender(DRIVEN, 64, weather, ("rgb", "event"), "curves") for weather in args.weathers]
     for control_frequency in args.control:
         rows = measure(contenders, control_frequency, args)
         save(rows, args.out, ("vehicles", "control_hz"))

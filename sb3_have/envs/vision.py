@@ -183,16 +183,17 @@ class VisionSensors:
     def _sense(self, poses: Array, duration: float, rng: np.random.Generator) -> Observation:
         objects = self.camera.objects(poses, self._sizes)
         self._view = last = objects.last(len(poses), self.image_size**2)
-        # A generator each, always drawn: the noise of one sensor does not depend on which others there are.
-        picture_rng, event_rng = (np.random.default_rng(seed) for seed in rng.integers(2**63, size=2))
+        # A seed each, always drawn: the noise of one sensor does not depend on which others there are.
+        picture_seed, event_seed = rng.integers(2**63, size=2)
         observation: Observation = {}
         if "rgb" in self.modalities or "event" in self.modalities:
             ground = self.camera.ground(poses)
         if "rgb" in self.modalities:
             picture = self._colour.render(ground.last(), last)[0]
-            observation["rgb"] = take_picture(picture, self.weather, picture_rng)
+            observation["rgb"] = take_picture(picture, self.weather, np.random.default_rng(picture_seed))
         if "event" in self.modalities:
-            observation["event"] = self._events(self._brightness.render(ground, objects)[..., 0], duration, event_rng)
+            frames = self._brightness.render(ground, objects)[..., 0]
+            observation["event"] = self._events(frames, duration, np.random.default_rng(event_seed))
         if "depth" in self.modalities:
             depth = self.camera.depth(last)
             observation["depth"] = encode_depth(depth, *self.depth_options.values())[..., None]
