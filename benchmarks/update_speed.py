@@ -65,7 +65,7 @@ from sb3_have.common.memory import keep_freed_memory
 FEATURES_DIM = 50
 NET_ARCH = [256, 256]
 BUFFER_SIZE = 500
-GROUP = ("device", "threads", "options", "shape", "modalities")
+GROUP = ("machine", "device", "threads", "options", "shape", "modalities")
 RATIOS = ("vs_sb3", "vs_sb3_shared", "vs_floor", "share")
 COLUMNS = {"contender", "precision", "median_ms", "q25_ms", "q75_ms", "cpu_ms", *RATIOS, "updates_per_s", "gpu_share"}
 PARTS = ("encoders", "decoding", "sampling")

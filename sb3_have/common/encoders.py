@@ -76,8 +76,8 @@ class BlockConv2d(nn.Conv2d):
     """
     A convolution that also reads images in blocks of stride x stride pixels (space to depth), see :func:`_look_up`.
 
-    The sums are the same: 8x8 with stride 4 on pixels is 2x2 with stride 1 on blocks of 4x4. On a CPU with AVX-512 the
-    latter takes 7 to 26% less time, forward and backward together. Without it the backward pass takes longer.
+    The sums are the same: 8x8 with stride 4 on pixels is 2x2 with stride 1 on blocks of 4x4. The latter takes less time
+    on a CPU with AVX-512 and more without it, because of the backward pass (``benchmarks.block_conv``).
     """
 
     def forward(self, images: th.Tensor) -> th.Tensor:
