@@ -28,6 +28,17 @@ def shifted_copies(samples: Samples, pixels: int, n_copies: int = 1) -> Samples:
     return samples._replace(**changed)
 
 
+def mean_over_copies(values: th.Tensor, n_copies: int) -> th.Tensor:
+    """
+    DrQ's averaged target: every copy of a sample gets the mean of the copies' values.
+
+    :param values: (M*B,), in the order of :func:`shifted_copies`
+    :param n_copies: M
+    :return: (M*B,)
+    """
+    return values.view(n_copies, -1).mean(dim=0).repeat(n_copies)
+
+
 def random_shift(observations: PyTorchObs, pixels: int, n_copies: int = 1) -> PyTorchObs:
     """
     Shifts the images by whole pixels; what comes in from outside repeats the image's edge. That is padding by

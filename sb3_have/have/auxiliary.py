@@ -2,15 +2,11 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Container, Mapping
-from typing import TYPE_CHECKING, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
-
-if TYPE_CHECKING:
-    from sb3_have.have.have import HAVESAC
-
 
 class LatentTransitions(NamedTuple):
     """A batch of transitions as an auxiliary loss sees it (B batch, d modalities, F features, A action dimensions)."""
@@ -53,10 +49,10 @@ class AuxiliaryLoss(nn.Module, ABC):
 
 class AuxiliaryLossCallback(BaseCallback):
     """
-    Sets the coefficients of auxiliary losses, when training starts and at every step.
+    Callback for setting the coefficients of auxiliary losses, when training starts and at every step.
 
-    The heads are part of the policy; this is the handle by which their losses are switched on and off. A coefficient
-    of 0 skips nothing but the gradient: the loss is still computed and logged.
+    The heads are part of the policy, and this callback switches their losses on and off. With a coefficient of 0 a loss
+    has no gradient, but it is still computed and logged.
 
     :param coefficients: coefficient of each term
     :param schedule: factor on all of them as a function of the progress remaining (1 at the start, 0 at the end), as
@@ -64,7 +60,7 @@ class AuxiliaryLossCallback(BaseCallback):
     :param verbose: as in SB3
     """
 
-    model: "HAVESAC"
+    model: Any  # a HAVESAC, whose module imports this one
 
     def __init__(
         self,

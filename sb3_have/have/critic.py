@@ -26,18 +26,18 @@ REFUSIONS = ("convex", "monotone", "free")
 
 
 class Values(NamedTuple):
-    """Everything that the critic says of a batch; None where ``value_estimation`` leaves a part out."""
+    """The values of a batch and their parts; None for the parts that ``value_estimation`` leaves out."""
 
     q: th.Tensor
-    """(K, B): the value that acts, H(q_g, q_l) for "have"."""
+    """(K, B): the Q-value used by the actor and the target, H(q_g, q_l) for "have"."""
     q_global: th.Tensor | None
-    """(K, B): q_g."""
+    """(K, B): q_g, the global value."""
     q_local: th.Tensor | None
-    """(K, d, B): q_i."""
+    """(K, d, B): q_i, the local values."""
     q_lve: th.Tensor | None
     """(K, B): q_l, the weighted sum of the local values (Eq. 6)."""
     weights: th.Tensor | None
-    """(B, d): w."""
+    """(B, d): w, the weights of the modalities (Eq. 9)."""
 
 
 class LocalCritics(nn.Module):
@@ -119,7 +119,7 @@ class AssignmentNetwork(nn.Module):
         self.key = nn.Linear(features_dim, attention_dim, bias=False)
 
     def forward(self, features: th.Tensor) -> th.Tensor:
-        return F.softmax(self.scores(features), dim=1)
+        return F.softmax(self.scores(features), dim=1)  # Eq. 9
 
     def scores(self, features: th.Tensor) -> th.Tensor:
         """(W_q z_g) . (W_k z_i) / sqrt(p): features (B, d, F) to (B, d)."""
@@ -158,7 +158,8 @@ class RefusionNetwork(nn.Module):
         n_inputs = n_modalities * features_dim
         if refusion == "convex":
             self.gate = nn.Linear(n_inputs, 2)
-            nn.init.normal_(self.gate.weight, std=1e-2)  # begin with about one half each
+            # Start with weights of about one half each
+            nn.init.normal_(self.gate.weight, std=1e-2)
             nn.init.zeros_(self.gate.bias)
         else:
             self.hyper_w1 = nn.Linear(n_inputs, 2 * hidden_dim)
@@ -183,17 +184,21 @@ class RefusionNetwork(nn.Module):
 
 class MultiModalCritic(BaseModel):
     """
-    Encoder and values of HAVE: ``critic(obs, actions)`` gives K values of shape (B, 1), as SB3's critics do.
+    Critic network(s) of HAVE: encoder, local critics, assignment network, global critic and re-fusion network.
 
-    :param observation_space: the policy's observation space
-    :param action_space: Box
-    :param encoder: from raw observations to features (B, d, F); the critic owns it
-    :param net_arch: widths of the hidden layers of every local and global critic
-    :param activation_fn: activation between the layers
-    :param n_critics: K
-    :param value_estimation: "have" H(q_g, q_l), "lve" q_l alone, "gve" q_g alone; only what is used is built
-    :param refusion: form of H, see :class:`RefusionNetwork`
-    :param attention_dim: p of Eq. 9
+    ``critic(obs, actions)`` returns one tensor (B, 1) for each of the K critics, as SB3's critics do.
+
+    :param observation_space: Observation space of the policy
+    :param action_space: Action space
+    :param encoder: Network from raw observations to features (B, d, F); the critic owns it
+    :param net_arch: Widths of the hidden layers of every local and global critic
+    :param activation_fn: Activation function
+    :param n_critics: Number of critic networks to create (K)
+    :param value_estimation: The Q-value: "have" is H(q_g, q_l), "lve" is q_l and "gve" is q_g; the networks that are
+        not needed are not created
+    :param refusion: The form of H, see :class:`RefusionNetwork`
+    :param attention_dim: Size of the queries and keys of the assignment network (p in Eq. 9)
+    :raises ValueError: for an unknown ``value_estimation`` or ``refusion``
     """
 
     assignment_class: ClassVar[type[AssignmentNetwork]] = AssignmentNetwork
@@ -228,7 +233,12 @@ class MultiModalCritic(BaseModel):
             self.refusion = RefusionNetwork(n_modalities, features_dim, refusion)
 
     def values(self, features: th.Tensor, actions: th.Tensor) -> Values:
-        """All values at features (B, d, F) and actions (B, A), weights computed once and shared by the twins."""
+        """
+        Compute the Q-values and their parts. The twins share the weights of the modalities.
+
+        :param features: (B, d, F)
+        :param actions: (B, A), scaled to [-1, 1]
+        """
         q_global = q_local = weights = None
         if self.value_estimation != "gve":
             q_local = self.local_critics(features, actions)
@@ -245,7 +255,7 @@ class MultiModalCritic(BaseModel):
         features: th.Tensor,
     ) -> Values:
         """
-        From the single critics' values to the one that acts, for any number K of them.
+        Mix global and local values to the Q-value, for any number K of critics.
 
         :param q_global: (K, B), None for "lve"
         :param q_local: (K, d, B), None for "gve"
@@ -260,24 +270,24 @@ class MultiModalCritic(BaseModel):
         return Values(q, q_global, q_local, q_lve, weights)
 
     def min_q(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """(B,): the value that actor and target use, the minimum over the twins after mixing."""
+        """The minimum over the twins after mixing, (B,), which the actor and the target use."""
         return self.values(features, actions).q.min(dim=0).values
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         return tuple(self.values(self.encoder(obs), actions).q.unsqueeze(2))
 
     def weights(self, features: th.Tensor) -> th.Tensor:
-        """Weights of the modalities (B, d) at features (B, d, F)."""
+        """The weights of the modalities (B, d), Eq. 9, for features (B, d, F)."""
         if self.value_estimation == "gve":
             raise ValueError('value_estimation="gve" has no weights of modalities: train with "have" or "lve".')
         return self.assignment(features)  # type: ignore[no-any-return]
 
     def decompose(self, obs: PyTorchObs, actions: th.Tensor) -> dict[str, th.Tensor]:
         """
-        The parts of the value, for study: ``q`` (K, B) and, where they exist, ``q_global`` (K, B), ``q_local``
-        (K, d, B), ``q_lve`` (K, B), ``weights`` (B, d).
+        Return the Q-value and its parts, to study them: ``q`` (K, B) and, where they exist, ``q_global`` (K, B),
+        ``q_local`` (K, d, B), ``q_lve`` (K, B) and ``weights`` (B, d).
 
-        :param obs: raw observations, as the critic takes them
+        :param obs: Raw observations, as :meth:`forward` takes them
         :param actions: (B, A), scaled to [-1, 1]
         """
         values = self.values(self.encoder(obs), actions)
@@ -285,7 +295,12 @@ class MultiModalCritic(BaseModel):
 
 
 def drop_modalities(features: th.Tensor, probability: float) -> th.Tensor:
-    """Blanks each modality of each sample of features (B, d, F) with this probability, but never all of a sample."""
+    """
+    Zero each modality of each sample with a probability, but always keep at least one.
+
+    :param features: (B, d, F)
+    :param probability: in [0, 1)
+    """
     if probability == 0:
         return features
     batch_size, n_modalities, _ = features.shape

@@ -13,7 +13,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import polyak_update
 
-from sb3_have.common.augmentation import check_random_shift, shifted_copies
+from sb3_have.common.augmentation import check_random_shift, mean_over_copies, shifted_copies
 from sb3_have.common.encoders import has_native_bfloat16
 from sb3_have.have.auxiliary import AuxiliaryLoss, LatentTransitions, auxiliary_classes, auxiliary_losses
 from sb3_have.have.critic import MultiModalCritic, Values, drop_modalities
@@ -26,44 +26,88 @@ TARGETS = ("bellman", "paper")
 
 class HAVESAC(SensorSAC):
     """
-    Soft actor-critic with Hierarchical Adaptive Value Estimation (HAVE, NeurIPS 2023) for agents with several sensors.
+    Hierarchical Adaptive Value Estimation on Soft Actor-Critic (HAVE-SAC)
 
-    Every modality of the observation has an encoder and a local critic; attention weighs the local values (LVE), a
-    global critic reads all features (GVE), and a hypernetwork mixes the two (re-fusion). Critic and auxiliary losses
-    train the encoders, in one backward pass; the actor reads their detached features. Parameters that are not listed
-    here are SAC's.
+    Reinforcement learning for agents with several sensors: every modality of the observation has an encoder and a local
+    critic. Attention weights the local values (LVE), a global critic reads the features of all modalities (GVE), and a
+    hypernetwork mixes the two (re-fusion). The critic's and the auxiliary losses train the encoders in one backward
+    pass; the actor reads the detached features.
 
-    :param policy: "MultiInputPolicy" or a subclass of :class:`MultiModalPolicy`
-    :param env: environment with Box actions and Dict (or Box) observations
-    :param replay_buffer_class: by default :class:`~sb3_have.ModalityReplayBuffer` for uint8 images and n-step returns,
-        SB3's otherwise; it is told the number of frames that VecFrameStack stacks
-    :param n_steps: length of n-step returns, for Dict observations too; DeepMDP then predicts n steps ahead from one
-        action
-    :param target_update_interval: updates between two target updates, counted over the whole training (SB3 counts them
-        anew in every call of ``train``, so that there it does nothing with ``gradient_steps=1``)
-    :param policy_delay: updates of the critic for one of the actor and the entropy temperature, counted likewise
-    :param value_estimation: which value acts: "have" (re-fusion of both), "lve" (weighted local values alone) or "gve"
-        (global value alone), the paper's ablations
-    :param refusion: form of the re-fusion network: "convex", "monotone" or "free" (the paper's), see
+    Paper: Huang et al., "Hierarchical Adaptive Value Estimation for Multi-modal Visual Reinforcement Learning",
+    NeurIPS 2023, https://nips.cc/virtual/2023/poster/70701
+
+    This implementation is written from the paper and builds on Stable-Baselines3's SAC
+    (https://arxiv.org/abs/1801.01290). The auxiliary losses are those of DeepMDP (https://arxiv.org/abs/1906.02736),
+    and the optional image augmentation is that of DrQ (https://arxiv.org/abs/2004.13649).
+
+    :param policy: The policy model to use ("MultiInputPolicy", or a subclass of :class:`MultiModalPolicy`)
+    :param env: The environment to learn from (if registered in Gymnasium, can be str). Its actions are a Box, its
+        observations a Dict of Boxes or a single Box.
+    :param learning_rate: Learning rate of the Adam optimizers of actor, critic and entropy coefficient; it can be a
+        function of the current progress remaining (from 1 to 0)
+    :param buffer_size: Size of the replay buffer
+    :param learning_starts: How many steps of the model to collect transitions for before learning starts
+    :param batch_size: Minibatch size for each gradient update
+    :param tau: The soft update coefficient ("Polyak update", between 0 and 1)
+    :param gamma: The discount factor
+    :param train_freq: Update the model every ``train_freq`` steps. Alternatively pass a tuple of frequency and unit
+        like ``(5, "step")`` or ``(2, "episode")``.
+    :param gradient_steps: How many gradient steps to do after each rollout (see ``train_freq``). ``-1`` means as many
+        gradient steps as steps done in the environment during the rollout.
+    :param action_noise: The action noise type (None by default), this can help for hard exploration problems
+    :param replay_buffer_class: Replay buffer class to use. If ``None``, :class:`~sb3_have.ModalityReplayBuffer` for
+        uint8 images and for n-step returns, and SB3's buffers otherwise.
+    :param replay_buffer_kwargs: Keyword arguments to pass to the replay buffer on creation. The number of stacked
+        frames, ``n_steps`` and ``gamma`` are filled in for a :class:`~sb3_have.ModalityReplayBuffer`.
+    :param optimize_memory_usage: SB3's memory-efficient variant of its own replay buffer for Box observations;
+        :class:`~sb3_have.ModalityReplayBuffer` stores every frame once anyway and refuses it.
+    :param n_steps: When ``n_steps > 1``, uses n-step returns when updating the Q-value networks, for Dict observations
+        too. DeepMDP then predicts n steps ahead from a single action.
+    :param ent_coef: Entropy regularization coefficient. Set it to "auto" to learn it automatically (and "auto_0.1" for
+        using 0.1 as initial value).
+    :param target_update_interval: Gradient steps between updates of the target networks, counted across calls to
+        :meth:`train` (SB3 starts counting again in every call, so its setting has no effect with
+        ``gradient_steps=1``)
+    :param policy_delay: Gradient steps of the critic for each one of the actor and the entropy coefficient, counted
+        across calls to :meth:`train`
+    :param target_entropy: Target entropy when learning ``ent_coef`` (``ent_coef="auto"``)
+    :param use_sde: Whether to use generalized State-Dependent Exploration (gSDE) instead of action noise exploration
+    :param sde_sample_freq: Sample a new noise matrix every n steps when using gSDE. Default: -1 (only sample at the
+        beginning of the rollout)
+    :param use_sde_at_warmup: Whether to use gSDE instead of uniform sampling during the warm-up phase (before learning
+        starts)
+    :param value_estimation: The Q-value used by the actor and the target: "have" (re-fusion of global and local
+        values), "lve" (weighted local values alone) or "gve" (global value alone), the ablations of the paper
+    :param refusion: The form of the re-fusion network: "convex", "monotone" or "free" (the paper's), see
         :class:`~sb3_have.have.critic.RefusionNetwork`
-    :param policy_kwargs: of :class:`MultiModalPolicy`; may give ``value_estimation`` and ``refusion`` in its place
-    :param target: "bellman": y = r + gamma (1 - done) (min_k H'_k - alpha log pi). "paper": Eq. 10 as it is written,
-        both sides of the Bellman equation mixed, y = min_k H'_k(y_g, y_l) with y_j = r + gamma (1 - done)
-        (q'_j - alpha log pi). With "convex" re-fusion, and without any ("lve", "gve"), the two are equal; with "free"
-        the second one may diverge. The paper's method is ``target="paper", refusion="free", local_coef=0``, and its LVE
-        ``value_estimation="lve", local_coef=0``.
-    :param local_coef: weight of the loss that also regresses q_g, q_l and every local value on the target (0 is the
+    :param target: "bellman" regresses on y = r + gamma (1 - done) (min_k H'_k - alpha log pi). "paper" is Eq. 10 as
+        written, which mixes both sides of the Bellman equation: y = min_k H'_k(y_g, y_l) with
+        y_j = r + gamma (1 - done) (q'_j - alpha log pi). The two are equal with "convex" re-fusion and without
+        re-fusion ("lve", "gve"); with "free" re-fusion the second one may diverge. The paper's method is
+        ``target="paper", refusion="free", local_coef=0``, its LVE ``value_estimation="lve", local_coef=0``.
+    :param local_coef: Weight of the loss that also regresses q_g, q_l and every local value on the target (0 in the
         paper)
-    :param modality_dropout: probability with which a modality's features are blanked in a training sample, for critic
-        and actor alike, never all of them
-    :param random_shift: pixels by which the images of a training sample are shifted at most, all sensors' alike, as in
-        DrQ (4 there), see :func:`~sb3_have.common.augmentation.random_shift`; 0 shifts nothing
-    :param n_augmentations: DrQ's K and M (2 there): differently shifted copies of a sample, over which target and
-        critic's loss are averaged; auxiliary losses and actor take the first
-    :param auxiliary: "deepmdp", None, or ``{name: AuxiliaryLoss class}`` ("deepmdp" included where wanted): the
-        auxiliary losses that are trained, with coefficient 1 (see :class:`~sb3_have.DeepMDPCallback`)
-    :param compile: whether to compile encoders, critics and auxiliary heads by ``torch.nn.Module.compile``, which
-        takes minutes; meant for CUDA, where it has not been tried yet
+    :param modality_dropout: Probability of zeroing a modality's features in a training sample, for critic and actor
+        alike; at least one modality is always kept
+    :param random_shift: Largest shift of the images of a training sample, in pixels, the same for all sensors (4 in
+        DrQ), see :func:`~sb3_have.common.augmentation.random_shift`. 0 switches it off.
+    :param n_augmentations: The K and M of DrQ (2 there): the number of differently shifted copies of a sample. Target
+        and critic loss are averaged over them; auxiliary losses and actor use the first.
+    :param auxiliary: The auxiliary losses to train, with coefficient 1: "deepmdp", None, or
+        ``{name: AuxiliaryLoss class}`` (including "deepmdp" if wanted), see :class:`~sb3_have.DeepMDPCallback`
+    :param compile: Whether to compile encoders, critics and auxiliary heads with ``torch.nn.Module.compile``. This
+        takes minutes and is meant for CUDA, where it has not been tried yet.
+    :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average the
+        reported success rate, mean episode length, and mean reward over
+    :param tensorboard_log: The log location for tensorboard (if None, no logging)
+    :param policy_kwargs: Additional arguments to be passed to the policy on creation, see :class:`MultiModalPolicy`;
+        ``value_estimation`` and ``refusion`` may be given here instead
+    :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for
+        debug messages
+    :param seed: Seed for the pseudo random generators
+    :param device: Device (cpu, cuda, ...) on which the code should be run. Setting it to "auto", the code will be run
+        on the GPU if possible.
+    :param _init_setup_model: Whether or not to build the network at the creation of the instance
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
@@ -195,11 +239,15 @@ class HAVESAC(SensorSAC):
             print(f"Image encoders compute in {self.critic.encoder.image_dtype(self.device)}")
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
+        # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
+
+        # Update learning rate according to lr schedule
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         if self.ent_coef_optimizer is not None:
             optimizers += [self.ent_coef_optimizer]
         self._update_learning_rate(optimizers)
+
         actor_parameters = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
         critic_parameters: list[th.Tensor] = list(self.critic.parameters())
         target_parameters: list[th.Tensor] = list(self.critic_target.parameters())
@@ -208,67 +256,87 @@ class HAVESAC(SensorSAC):
 
         for _ in range(gradient_steps):
             self._n_updates += 1
+
+            # Sample replay buffer
             replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-            first = slice(len(replay_data.rewards))
-            if self.random_shift > 0:  # DrQ: copies of the batch one behind the other, the first of them at ``first``
+            original = slice(len(replay_data.rewards))
+            if self.random_shift > 0:  # the shifted copies of the batch follow one another, the first is ``original``
                 replay_data = shifted_copies(replay_data, self.random_shift, self.n_augmentations)
+            # For n-step returns, the discount factor is gamma**n_steps (when no early termination)
             discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
 
-            # Each observation is encoded once; the target encoder's features also feed the next action and DeepMDP
+            # Encode every observation once. The features of the target encoder serve the next action, the target
+            # and DeepMDP
             features = self.policy.encode(replay_data.observations)
             with th.no_grad():
                 next_features = self.critic_target.encoder(replay_data.next_observations)
             inputs = drop_modalities(features, self.modality_dropout)
+
+            # We need to sample because `log_std` may have changed between two gradient steps
             if self.use_sde:
                 self.actor.reset_noise()
             ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
 
-            # Critics, and the auxiliary losses on the same features: one backward pass, one optimizer
             with th.no_grad():
+                # Select action according to policy
                 next_actions, next_log_prob = self.actor.action_log_prob(next_features.flatten(start_dim=1))
+                # Compute the target (Eq. 8, or Eq. 10): min over all critics, and entropy term
                 entropy_bonus = -ent_coef * next_log_prob
                 rewards, not_done = replay_data.rewards.squeeze(1), 1 - replay_data.dones.squeeze(1)
                 discounts = (discounts.squeeze(1) if isinstance(discounts, th.Tensor) else discounts) * not_done
                 target_q = self._target_values(next_features, next_actions, rewards, discounts, entropy_bonus)
-                # DrQ's K and M: all copies of a sample have the mean of their targets
-                target_q = target_q.view(self.n_augmentations, -1).mean(dim=0).repeat(self.n_augmentations)
+                target_q = mean_over_copies(target_q, self.n_augmentations)
+
+            # Get the current Q-values (Eq. 6, Eq. 9, section 3.4), using actions from the replay buffer
             values = self.critic.values(inputs, replay_data.actions)
+
+            # Compute critic loss
             critic_loss = self._critic_loss(values, target_q)
             logs.setdefault("critic_loss", []).append(critic_loss.detach())
+
+            # Add the auxiliary losses (Eq. 12) on the same features
             latent = (features, replay_data.actions, replay_data.rewards, next_features, replay_data.dones)
-            batch = LatentTransitions(*(tensor[first] for tensor in latent))
+            batch = LatentTransitions(*(tensor[original] for tensor in latent))
             loss = critic_loss
             for term, aux_loss in auxiliary_losses(self.policy.auxiliary, batch, self.auxiliary_coefs).items():
                 loss = loss + self.auxiliary_coefs[term] * aux_loss
                 logs.setdefault(f"aux_{term}_loss", []).append(aux_loss.detach())
+
+            # Optimize critic, encoders and auxiliary heads
             self.critic.optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             self.critic.optimizer.step()
 
-            # Entropy temperature (see SB3's SAC), and actor (Eq. 11): minimum over the twins after mixing, gradients
-            # for the actor's parameters alone
             if self._n_updates % self.policy_delay == 0:
-                actor_inputs = inputs[first].detach()
+                # Action by the current actor for the sampled state, on detached features
+                actor_inputs = inputs[original].detach()
                 actions_pi, log_prob = self.actor.action_log_prob(actor_inputs.flatten(start_dim=1))
+
+                # Optimize entropy coefficient, also called entropy temperature or alpha in the paper
                 if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
                     ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
                     self.ent_coef_optimizer.zero_grad()
                     ent_coef_loss.backward()  # type: ignore[no-untyped-call]
                     self.ent_coef_optimizer.step()
                     logs.setdefault("ent_coef_loss", []).append(ent_coef_loss.detach())
+
+                # Compute actor loss (Eq. 11): min over all critics after mixing
                 min_q_pi = self.critic.min_q(actor_inputs, actions_pi)
                 actor_loss = (ent_coef * log_prob - min_q_pi).mean()
+                logs.setdefault("actor_loss", []).append(actor_loss.detach())
+                logs.setdefault("ent_coef", []).append(ent_coef)
+
+                # Optimize the actor; `actor_loss.backward()` would also compute gradients of the critic, for nothing
                 gradients = th.autograd.grad(actor_loss, actor_parameters, allow_unused=True)
                 for parameter, gradient in zip(actor_parameters, gradients, strict=True):
                     parameter.grad = gradient
                 self.actor.optimizer.step()
-                logs.setdefault("actor_loss", []).append(actor_loss.detach())
-                logs.setdefault("ent_coef", []).append(ent_coef)
 
-            # Target networks: encoder, every critic, assignment and re-fusion
+            # Update target networks: encoder, every critic, assignment and re-fusion
             if self._n_updates % self.target_update_interval == 0:
                 with th.no_grad():
                     th._foreach_lerp_(target_parameters, critic_parameters, self.tau)
+                # Copy running stats, see SB3's issue #996
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -282,8 +350,10 @@ class HAVESAC(SensorSAC):
 
     def _record_losses(self) -> None:
         """
-        Reads the losses, for which a GPU has to finish its work: so there only in :meth:`dump_logs`, and not where a
-        callback dumps the logger itself, as EvalCallback does.
+        Log the mean losses since the last call: train/critic_loss, train/actor_loss, train/ent_coef,
+        train/ent_coef_loss, train/aux_<term>_loss.
+
+        ``.item()`` makes the host wait for a GPU, so there the losses are only read when :meth:`dump_logs` is called.
         """
         for name, loss in self._last_losses.items():
             self.logger.record(f"train/{name}", loss.item())
@@ -298,7 +368,7 @@ class HAVESAC(SensorSAC):
         entropy_bonus: th.Tensor,
     ) -> th.Tensor:
         """
-        The regression target y (B,).
+        The regression target y (B,): the Bellman target (Eq. 8), or Eq. 10 with ``target="paper"``.
 
         :param next_features: (B, d, F) by the target encoder
         :param next_actions: (B, A) by the actor
@@ -312,12 +382,12 @@ class HAVESAC(SensorSAC):
             target_lve = rewards + discounts * (values.q_lve + entropy_bonus)  # type: ignore[operator]
             mixed: th.Tensor = self.critic_target.refusion(target_global, target_lve, next_features)
             return mixed.min(dim=0).values  # Eq. 10
-        return rewards + discounts * (self.critic_target.min_q(next_features, next_actions) + entropy_bonus)
+        return rewards + discounts * (self.critic_target.min_q(next_features, next_actions) + entropy_bonus)  # Eq. 8
 
     def _critic_loss(self, values: Values, target_q: th.Tensor) -> th.Tensor:
         """
-        Squared error of the value that acts and, times ``local_coef``, of its parts: q_g, q_l, and the mean over the
-        modalities of q_i. Halved and summed over the twins, as SB3 does.
+        Squared error of the Q-value and, times ``local_coef``, of its parts: q_g, q_l, and the mean over the modalities
+        of q_i. It is halved and summed over the twins, as in SB3.
 
         :param values: the critic's values at the sampled actions
         :param target_q: (B,)

@@ -24,38 +24,42 @@ SelfGaussian = TypeVar("SelfGaussian", bound="SquashedGaussian")
 
 class MultiModalPolicy(SACPolicy):
     """
-    Policy of HAVESAC for Dict observations (images and vectors mixed) or a single Box.
+    Policy class (with actor, critic and auxiliary heads) for HAVESAC, for Dict observations (images and vectors mixed)
+    or a single Box.
 
-    The critic owns the encoder: critic and auxiliary losses train it. The actor, SB3's own, reads the detached
-    features, so ``policy.actor`` takes features (B, d*F) and ``policy(obs)`` or ``policy.predict(obs)`` observations.
-    SB3's ``share_features_extractor=True`` does the reverse, it trains the encoder by the actor's loss.
+    The critic owns the encoder, and the critic's and the auxiliary losses train it. The actor is SB3's and reads the
+    detached features, so ``policy.actor`` takes features (B, d*F), while ``policy(obs)`` and ``policy.predict(obs)``
+    take observations. SB3's ``share_features_extractor=True`` does the reverse: it trains the encoder with the actor
+    loss.
 
-    :param observation_space: Dict of Boxes, or a Box
-    :param action_space: Box
-    :param lr_schedule: learning rate as a function of the progress remaining
-    :param net_arch: hidden layers of actor and critics, as in SB3: a list, or ``dict(pi=[...], qf=[...])``
-    :param activation_fn: activation of actor and critics
-    :param use_sde: whether to explore by gSDE
-    :param log_std_init: initial log standard deviation of gSDE
-    :param use_expln: gSDE: ``expln()`` instead of ``exp()``
-    :param clip_mean: gSDE: bound of the mean action
-    :param normalize_images: whether uint8 images are decoded, see :class:`~sb3_have.common.encoders.MultiModalEncoder`
-    :param optimizer_class: optimizer of actor and critic
-    :param optimizer_kwargs: its keyword arguments, without the learning rate
-    :param n_critics: number of critics (twins)
-    :param features_dim: F, features of each modality
-    :param modalities: observation keys of each modality; by default each key is one
-    :param encoder_classes: own encoder classes of some modalities
-    :param encoder_kwargs: keyword arguments of the encoders of some modalities
-    :param signed_keys: image keys of signed counts around 128; by default those with "event" in their name
-    :param precision: arithmetic of the image encoders: "auto", "float32" or "bfloat16"
-    :param fusion: what mixes feature maps between the encoders: "concat" (nothing), "transfuser", "efnet", or an own
+    :param observation_space: Observation space
+    :param action_space: Action space
+    :param lr_schedule: Learning rate schedule (could be constant)
+    :param net_arch: The specification of the actor and critic networks, as in SB3: a list, or
+        ``dict(pi=[...], qf=[...])``
+    :param activation_fn: Activation function
+    :param use_sde: Whether to use State-Dependent Exploration or not
+    :param log_std_init: Initial value for the log standard deviation
+    :param use_expln: Use ``expln()`` function instead of ``exp()`` when using gSDE to ensure a positive standard
+        deviation
+    :param clip_mean: Clip the mean output when using gSDE to avoid numerical instability
+    :param normalize_images: Whether to decode uint8 images, see :class:`~sb3_have.common.encoders.MultiModalEncoder`
+    :param optimizer_class: The optimizer to use, ``th.optim.Adam`` by default
+    :param optimizer_kwargs: Additional keyword arguments, excluding the learning rate, to pass to the optimizer
+    :param n_critics: Number of critic networks to create
+    :param features_dim: Number of features of each modality (F)
+    :param modalities: The observation keys of each modality; by default every key is a modality
+    :param encoder_classes: Custom encoder classes for some modalities
+    :param encoder_kwargs: Keyword arguments for the encoders of some modalities
+    :param signed_keys: Image keys that hold signed counts around 128; by default those with "event" in their name
+    :param precision: Arithmetic of the image encoders: "auto", "float32" or "bfloat16"
+    :param fusion: Fusion of feature maps between the encoders: "concat" (none), "transfuser", "efnet", or a custom
         class, see :mod:`sb3_have.common.fusion`
-    :param fusion_kwargs: its keyword arguments, and ``stages``, the convolutions it comes after
-    :param value_estimation: "have", "lve" or "gve"
-    :param refusion: "convex", "monotone" or "free"
-    :param attention_dim: p of Eq. 9
-    :param auxiliary_losses: heads of auxiliary losses by name, in addition to DeepMDP's
+    :param fusion_kwargs: Keyword arguments for the fusion, and ``stages``, the convolutions after which it is applied
+    :param value_estimation: "have", "lve" or "gve", see :class:`~sb3_have.have.critic.MultiModalCritic`
+    :param refusion: "convex", "monotone" or "free", see :class:`~sb3_have.have.critic.RefusionNetwork`
+    :param attention_dim: Size of the queries and keys of the assignment network (p in Eq. 9)
+    :param auxiliary_losses: Auxiliary losses by name, in addition to DeepMDP's
     """
 
     critic: MultiModalCritic  # type: ignore[assignment]
@@ -216,7 +220,7 @@ class MultiModalPolicy(SACPolicy):
 
 
 class SquashedGaussian(SquashedDiagGaussianDistribution):
-    """SB3's, without torch's check for NaN on a GPU: the host would have to wait for it in every step."""
+    """SB3's distribution without PyTorch's check for NaN on a GPU, which would make the host wait in every step."""
 
     def proba_distribution(self: SelfGaussian, mean_actions: th.Tensor, log_std: th.Tensor) -> SelfGaussian:
         validate_args = None if mean_actions.device.type == "cpu" else False
