@@ -8,6 +8,7 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
 
+
 class LatentTransitions(NamedTuple):
     """A batch of transitions as an auxiliary loss sees it (B batch, d modalities, F features, A action dimensions)."""
 
