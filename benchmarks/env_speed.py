@@ -132,7 +132,7 @@ def main() -> None:
     contenders += [Contender(DRIVEN, 64, weather, ("rgb", "event"), "curves") for weather in args.weathers]
     for control_frequency in args.control:
         rows = measure(contenders, control_frequency, args)
-        save(rows, args.out, ("vehicles", "control_hz"))
+        save(rows, args.out, ("machine", "vehicles", "control_hz"))
         print(f"{control_frequency} Hz control over 20 Hz simulation, {args.rounds} x {args.steps} steps")
         show(rows, COLUMNS)
     print(rows[0]["machine"], rows[0]["versions"], sep="\n")

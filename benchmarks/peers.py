@@ -13,7 +13,7 @@ and target every time. ``camera``: RGB at 64x64 px, three stacked frames, the Na
 - ``SB3 SAC`` and ``SB3 SAC shared``: see ``benchmarks.update_speed``.
 
 ``vector``: ``ReliabilityDrive-v0``, three sensors of 32 numbers, two layers of 256, batch 256. ``SB3 SAC`` and ``sbx
-SAC`` (``pip install "sb3_have[benchmark]"``, left out where it is not installed) read them flattened. HAVESAC has an
+SAC`` (``pip install "sb3_have[peers]"``, left out where it is not installed) read them flattened. HAVESAC has an
 encoder for each sensor (a linear layer of 50 and LayerNorm) in front.
 
 Columns: ``what`` is ``update`` (one gradient step, sampling included), ``act and store`` (an action for one
@@ -221,7 +221,7 @@ def vector(batch_size: int = 256) -> dict[Contender, Callable[[], object]]:
         ),
     }
     if find_spec("sbx") is None:
-        print('sbx is not installed and left out: pip install "sb3_have[benchmark]"')
+        print('sbx is not installed and left out: pip install "sb3_have[peers]"')
     else:
         sbx: Any = import_module("sbx")
         models["sbx SAC"] = sbx.SAC("MlpPolicy", FlattenObservation(gym.make(VECTOR_ENV)), **options)

@@ -17,7 +17,9 @@ from pathlib import Path
 from typing import Any
 
 import pandas as pd
+import torch as th
 from stable_baselines3.common.monitor import load_results
+from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_have.common.drivers import KeepStraightDriver, RandomDriver
 from sb3_have.common.episodes import Predictor
@@ -34,7 +36,7 @@ STEPS = 10_000
 MINUTES = 11.5
 """Training stops here, so that the demo stays within a quarter of an hour on two cores; evaluation took 2.4 there."""
 EPISODES = 2
-N_ENVS = 16
+PROCESSES = 2
 SHOWN = "HardRainNight"
 
 
@@ -76,6 +78,8 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
         each = 1e3 * run.seconds / max(1, model.num_timesteps)
         print(f"{model.num_timesteps} steps in {run.seconds:.0f} s, {each:.0f} ms each")
 
+    # the environments' processes need the cores now
+    th.set_num_threads(1)
     env_kwargs = evaluation_env_kwargs(config)
     drivers: dict[str, Predictor] = {
         "HAVESAC": model,
@@ -86,7 +90,14 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
     with phase(f"Evaluating {len(drivers)} drivers, {n_episodes} episodes in each of {len(WEATHERS)} weathers"):
         results = {
             name: evaluate(
-                driver, ENV_ID, WEATHERS, n_episodes, env_kwargs=env_kwargs, n_envs=N_ENVS, progress_bar=True
+                driver,
+                ENV_ID,
+                WEATHERS,
+                n_episodes,
+                env_kwargs=env_kwargs,
+                n_envs=PROCESSES,
+                progress_bar=True,
+                vec_env_cls=SubprocVecEnv,
             )
             for name, driver in drivers.items()
         }

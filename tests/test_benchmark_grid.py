@@ -169,3 +169,13 @@ def test_shipped_grids_train_alike() -> None:
     assert common == {name: vars(extended)[name] for name in common}
     assert set(core.methods).isdisjoint(extended.methods)
     assert isinstance(core, Grid)
+
+
+def test_a_carla_server_has_one_environment(tmp_path: Path) -> None:
+    path = tmp_path / "carla.yml"
+    text = "env: CarlaVision-v0\nmethods: [havesac]\nseeds: [0]\n"
+    path.write_text(text)
+    with pytest.raises(GridError, match="eval_envs: 1"):
+        read_grid(path)
+    path.write_text(text + "eval_envs: 1\n")
+    assert read_grid(path).eval_envs == 1

@@ -49,6 +49,32 @@ def fake_vec_env(**kwargs: Any) -> VecEnv:
     return DummyVecEnv([lambda: gym.make(ENV_ID, **kwargs)])
 
 
+class Jerks(gym.Wrapper[Any, Any, Any, Any]):
+    """Rewards the change from the last action, which it keeps as it was given."""
+
+    last: np.ndarray | None = None
+
+    def step(self, action: np.ndarray) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        jerk = 0.0 if self.last is None else float(np.abs(action - self.last).sum())
+        self.last = action
+        observation, _, terminated, truncated, info = self.env.step(action)
+        return observation, jerk, terminated, truncated, info
+
+
+def test_environments_may_keep_their_actions() -> None:
+    """The array of one step is not filled again in the next."""
+
+    class Alternating(Watcher):
+        sign = 1.0
+
+        def predict(self, observation: Any, *args: Any, **kwargs: Any) -> tuple[np.ndarray, Any]:
+            self.sign = -self.sign
+            return np.full((len(observation["rgb"]), 2), self.sign, np.float32), None
+
+    episodes = evaluate_episodes(Alternating(), ENV_ID, ["slow"], n_episodes=1, env_wrapper=Jerks)
+    assert episodes["return"].tolist() == [4.0 * (episodes["steps"][0] - 1)]
+
+
 def test_known_answers() -> None:
     """A coasting car earns its metres: the statistics follow from the episode lengths, seed % 5 + 4."""
     frame = evaluate(Watcher(), ENV_ID, WEATHERS, n_episodes=6, seed=3)

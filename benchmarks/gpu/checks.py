@@ -35,6 +35,7 @@ from benchmarks.gpu.graph import (
     StaticBatch,
     difference,
     exact_arithmetic,
+    loss_difference,
     losses_of,
     parameters,
     relative_difference,
@@ -142,7 +143,7 @@ def check_losses(
         found = update(model, batch)
     if not (expected[0] and expected[0].keys() == found[0].keys()):
         return False, f"losses {sorted(expected[0])} and {sorted(found[0])}"
-    loss, name = max((abs(found[0][name] - value) / (abs(value) + 1e-6), name) for name, value in expected[0].items())
+    loss, name = loss_difference(expected[0], found[0])
     gradient, worst = relative_difference(expected[1], found[1])
     ok = max(loss, gradient) < tolerance
     detail = f"losses differ by {loss:.1e} ({name}), gradients by {gradient:.1e} ({worst or 'none'}); {tolerance:g} may"
@@ -337,15 +338,16 @@ def check_graph_no_waiting(setting: Setting) -> Result:
 
 
 def check_compile(setting: Setting) -> Result:
-    """Compiled modules compute the eager losses."""
+    """Compiled modules compute the eager losses and gradients."""
     models = [setting.model(compile=compiled) for compiled in (False, True)]
     assert models[0].replay_buffer is not None
     batch = models[0].replay_buffer.sample(setting.batch_size)
     assert isinstance(batch, DictReplayBufferSamples)
     with exact_arithmetic():
-        (expected, _), (found, _) = (update(model, batch) for model in models)
-    loss = max(abs(found[name] - value) / (abs(value) + 1e-6) for name, value in expected.items())
-    return loss < 1e-3, f"losses differ by {loss:.1e}"
+        expected, found = (update(model, batch) for model in models)
+    loss, _ = loss_difference(expected[0], found[0])
+    gradient, _ = relative_difference(expected[1], found[1])
+    return max(loss, gradient) < 1e-3, f"losses differ by {loss:.1e}, gradients by {gradient:.1e}"
 
 
 def checks(setting: Setting) -> dict[str, Check]:

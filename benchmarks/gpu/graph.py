@@ -14,6 +14,7 @@ nothing could be recorded.
 from __future__ import annotations
 
 import argparse
+import math
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -214,12 +215,17 @@ def difference(device: str, image_size: int, batch_size: int, updates: int = 10,
             for _ in range(updates):
                 train()
                 history[-1].append(losses_of(model))
-    losses = [
-        abs(ours[name] - theirs[name]) / (abs(theirs[name]) + 1e-6)
-        for theirs, ours in zip(*history, strict=True)
-        for name in theirs
-    ]
+    losses = [loss_difference(theirs, ours)[0] for theirs, ours in zip(*history, strict=True)]
     return max(losses), relative_difference(*(parameters(model.policy) for model in models))[0]
+
+
+def loss_difference(reference: dict[str, float], other: dict[str, float]) -> tuple[float, str]:
+    """The greatest relative difference of two losses of the same name, infinite for NaN, and the name."""
+    worst = 0.0, ""
+    for name, value in reference.items():
+        difference = abs(other[name] - value) / (abs(value) + 1e-6)
+        worst = max(worst, (difference if math.isfinite(difference) else math.inf, name))
+    return worst
 
 
 def parameters(module: th.nn.Module) -> dict[str, th.Tensor]:

@@ -40,7 +40,8 @@ part() {
     if [ "$(left)" -lt "$limit" ]; then limit=$(left); fi
     if [ "$limit" -lt 5 ]; then
         echo "-- no time: $*"
-        return
+        failed=1
+        return 1
     fi
     echo "-- after $SECONDS s, for at most $limit s: $*"
     timeout --kill-after=5 "$limit" "$PYTHON" -m "$@"

@@ -215,6 +215,8 @@ def _check_whole(grid: Grid) -> None:
         raise GridError(f"weathers: there is no {unknown[0]!r}{_remedy(unknown[0], WEATHERS)}")
     if grid.env in OWN_ENVS and (unknown := [name for name in grid.modalities if name not in SENSORS]):
         raise GridError(f"modalities: there is no {unknown[0]!r}{_remedy(unknown[0], SENSORS)}")
+    if grid.env == "CarlaVision-v0" and grid.eval_envs > 1:
+        raise GridError(f"eval_envs: {grid.eval_envs} environments cannot share a CARLA server; write eval_envs: 1")
     if "n_timesteps" in grid.hyperparams:
         raise GridError("hyperparams: n_timesteps does nothing here; the steps of all runs are 'steps'")
     for part in ("env_kwargs", "policy_kwargs"):

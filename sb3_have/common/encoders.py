@@ -327,7 +327,7 @@ def _look_up(images: th.Tensor, signed: bool, dtype: th.dtype, block_size: int =
     """
     batch, channels, height, width = images.shape
     table = _table(signed, dtype)
-    if block_size > 1:
+    if block_size > 1 and batch > 0:
         # The pixels of a row of a block are moved as one integer
         rows = images.contiguous().numpy().view(f"u{block_size}")
         rows = rows.reshape(batch, channels, height // block_size, block_size, width // block_size)
@@ -365,3 +365,8 @@ def has_native_bfloat16(device_type: str) -> bool:
     if device_type == "cuda":
         return th.cuda.get_device_capability() >= (8, 0)
     return device_type == "cpu" and th.cpu._is_amx_tile_supported()
+
+
+# The compiler cannot look at the hardware. This is what `th.compiler.assume_constant_result` does, which would import
+# the compiler, in as much time as all of PyTorch.
+has_native_bfloat16._dynamo_marked_constant = True  # type: ignore[attr-defined]

@@ -29,9 +29,9 @@ class Predictor(Protocol):
 class Task(NamedTuple):
     """One episode to drive.
 
-    :param weather: of the episode
-    :param seed: of the episode
-    :param env_wrapper: applied to its environment; the same object for tasks that may share one
+    :param weather: Weather in which to drive
+    :param seed: Seed of the episode
+    :param env_wrapper: Wrapper of the environment; tasks with the same object may share an environment
     """
 
     weather: str
@@ -93,25 +93,26 @@ def leave_interrupts_to_parent() -> None:
 def drive(model: Predictor, vec_env: VecEnv, deterministic: bool = True) -> Iterator[tuple[int, dict[str, Any]]]:
     """Drive the episodes of :class:`EpisodeQueue` environments, all environments by one ``predict``.
 
-    Environments with an empty queue are left out of the batch, unless the model returns a recurrent ``state``, which
-    has a row for every environment.
+    Environments with an empty queue are left out of the batch, so the rows of a batch may become fewer, unless the
+    model returns a recurrent ``state``, which has a row for every environment.
 
-    :param model: reads the observations; rule-based drivers are shown every ``info`` by ``read_infos``
-    :param vec_env: of n environments
-    :param deterministic: whether the policy's mode is driven rather than a sample of it
-    :return: the number of each episode as it ends, and ``return, steps, distance, crashed, offroad``; what the
-        environment's ``info`` does not tell is NaN
+    :param model: The driver; a rule-based one gets every ``info`` through ``read_infos``
+    :param vec_env: n environments
+    :param deterministic: Whether to use deterministic actions
+    :return: The number of each episode as it ends, and its ``return, steps, distance, crashed, offroad``; a value that
+        the environment's ``info`` does not have is NaN
     """
     observations = vec_env.reset()
     infos: list[dict[str, Any]] = list(vec_env.unwrapped.reset_infos)
     numbers: list[int | None] = vec_env.get_attr("number")
     returns, steps = np.zeros(len(numbers)), np.zeros(len(numbers), dtype=int)
-    actions = np.zeros((len(numbers), *(vec_env.action_space.shape or ())), vec_env.action_space.dtype)
+    action_shape = (len(numbers), *(vec_env.action_space.shape or ()))
     state, starts = None, np.ones(len(numbers), dtype=bool)
     while any(number is not None for number in numbers):
         rows = [i for i, number in enumerate(numbers) if number is not None or state is not None]
         if hasattr(model, "read_infos"):
             model.read_infos([infos[i] for i in rows])
+        actions = np.zeros(action_shape, vec_env.action_space.dtype)  # environments may keep their row of it
         actions[rows], state = model.predict(
             _rows_of(observations, rows), state=state, episode_start=starts[rows], deterministic=deterministic
         )
@@ -122,8 +123,8 @@ def drive(model: Predictor, vec_env: VecEnv, deterministic: bool = True) -> Iter
         for i, number in enumerate(numbers):
             if number is None or not starts[i]:
                 continue
-            told = {key: float(infos[i].get(key, np.nan)) for key in ("distance", "crashed", "offroad")}
-            yield number, {"return": returns[i], "steps": int(steps[i]), **told}
+            outcome = {key: float(infos[i].get(key, np.nan)) for key in ("distance", "crashed", "offroad")}
+            yield number, {"return": returns[i], "steps": int(steps[i]), **outcome}
             returns[i], steps[i] = 0.0, 0
             # the newest info and number are those of the next episode, which the reset began
             infos[i], numbers[i] = vec_env.unwrapped.reset_infos[i], vec_env.get_attr("number", indices=i)[0]

@@ -127,7 +127,7 @@ def drive_tasks(
     # All tasks are driven to their end, so it does not matter which environment drives which. Environments of one
     # process share a queue, and none waits while there is something left; processes have fixed shares.
     numbered = list(enumerate(tasks))
-    shares = [numbered] if vec_env_cls is DummyVecEnv else [numbered[i::n_envs] for i in range(n_envs)]
+    shares = [numbered] if issubclass(vec_env_cls, DummyVecEnv) else [numbered[i::n_envs] for i in range(n_envs)]
     queues = [deque(share) for share in shares] * (n_envs // len(shares))
     makers: list[Any] = [partial(EpisodeQueue, env_id, queue, dict(env_kwargs or {})) for queue in queues]
     vec_env: VecEnv = vec_env_cls(makers)

@@ -57,9 +57,9 @@ class GroundView:
         #: Size of a pixel on the ground, (rows, 1).
         self.wide = forward / np.float32(focal)
         self.long = np.minimum(self.wide * forward / np.float32(height), np.float32(LONGEST))
-        # The verge is a patchwork of random brightness, the same in every episode.
-        #: Patches of 1 m average out where they are smaller than a pixel: the share of their contrast that is left.
+        # Patches of 1 m average out where they are smaller than a pixel: the share of their contrast that is left.
         self.contrast = np.minimum(1, 2 / np.maximum(self.wide, self.long))
+        # The verge is a patchwork of random brightness, the same in every episode.
         self.patchwork = np.random.default_rng(0).uniform(0.55, 1.45, (64, 64)).astype(np.float32)
 
     def look(self, x: Array, y: Array, heading: Array) -> Ground:

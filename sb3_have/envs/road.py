@@ -96,6 +96,7 @@ class HighwayRoad(Road):
             super().act()
         finally:
             self._placed = None
+            self._on_lane, self._motions = {}, {}
 
     def _places(self) -> list[Placed]:
         bend, places = self.network.bend, [v.position.tolist() for v in self.vehicles]

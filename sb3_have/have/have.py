@@ -14,7 +14,6 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import polyak_update
 
 from sb3_have.common.augmentation import check_random_shift, mean_over_copies, shifted_copies
-from sb3_have.common.encoders import has_native_bfloat16
 from sb3_have.have.auxiliary import AuxiliaryLoss, LatentTransitions, auxiliary_classes, auxiliary_losses
 from sb3_have.have.critic import MultiModalCritic, Values, drop_modalities
 from sb3_have.have.experience import SensorSAC, has_images
@@ -232,7 +231,6 @@ class HAVESAC(SensorSAC):
         check_random_shift(self.observation_space, self.random_shift, self.n_augmentations)
         super()._setup_model()
         if self.compile:
-            th.compiler.assume_constant_result(has_native_bfloat16)  # type: ignore[no-untyped-call]
             for module in (*self.critic.children(), *self.critic_target.children(), *self.policy.auxiliary.values()):
                 module.compile()
         if self.verbose >= 1 and has_images(self.observation_space):
