@@ -109,7 +109,7 @@ class Run:
     :param algo: name in :func:`algorithms`
     :param eval_freq: steps from one evaluation to the next, 0 for none
     :param eval_episodes: episodes in each weather of an evaluation
-    :param eval_envs: environments of an evaluation at a time, with one ``predict`` for all of them
+    :param eval_envs: number of environments that an evaluation drives at a time, with one ``predict`` for all of them
     :param eval_env_kwargs: for the evaluation's environments, over the configuration's ``env_kwargs``
     :param weathers: to evaluate in
     :param save_freq: steps from one checkpoint to the next, 0 for one at the end only
@@ -319,7 +319,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder of the run; the same folder resumes it")
     parser.add_argument("--eval-freq", type=int, default=10_000, help="steps between evaluations, 0 for none")
     parser.add_argument("--eval-episodes", type=int, default=2, help="in each weather")
-    parser.add_argument("--eval-envs", type=int, default=1, help="that are driven at a time; default: %(default)s")
+    parser.add_argument(
+        "--eval-envs",
+        type=int,
+        default=1,
+        help="environments of an evaluation that are driven at a time; default: %(default)s",
+    )
     parser.add_argument(
         "--eval-vec-env",
         choices=list(VEC_ENVS),

@@ -220,7 +220,7 @@ def batches(buffer: Any, batch_size: int, n_batches: int) -> list[DictReplayBuff
 def check_replay(setting: Setting, storage: str, n_batches: int = 30) -> Result:
     """
     Batches are what SB3's buffer holds, though the copies of many are under way at once: the GPU is kept busy, so that
-    memory that were written again too early would show.
+    memory that was overwritten too early would show.
     """
     env = make_env(TWO, setting.image_size, episode_length=7)
     arguments = (200, env.observation_space, env.action_space)

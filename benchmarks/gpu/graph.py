@@ -87,7 +87,7 @@ class GraphedUpdate:
     them and launches the graph. The first calls are eager, since libraries and optimizers set themselves up in them.
     Updates with and without actor and target (``policy_delay``, ``target_update_interval``) have graphs of their own.
     The learning rate is a tensor, so that its schedule goes on; all other numbers are what they were when the graph was
-    recorded, above all ``auxiliary_coefs``, ``tau`` and ``gamma``. The parameters must stay where they are, too.
+    recorded, above all ``auxiliary_coefs``, ``tau`` and ``gamma``. The parameters must stay at their addresses.
 
     :param model: with Adam and a constant number of samples in a batch; its optimizers are made capturable
     :param batch_size: of every update

@@ -46,7 +46,7 @@ def start(folder: Path, config: str, seed: int, core: int, seconds: float, devic
 
 
 def result(folder: Path, exit_code: int | None) -> Row:
-    """What a run has come to."""
+    """Progress of a run."""
     newest = max((checkpoint_info(path) for path in checkpoints(folder)), key=lambda info: info["steps"], default=None)
     row: Row = {"exit_code": exit_code, "steps": None, "seconds": None, "steps_per_s": None}
     if newest is not None:

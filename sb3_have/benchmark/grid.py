@@ -12,7 +12,7 @@ A grid is a YAML file; only ``methods`` and ``seeds`` have to be there::
     eval_freq: 5000                # steps between the points of the learning curve, 0 for none
     eval_episodes: 1               # of a point, in each weather
     final_episodes: 10             # after training, in each weather
-    eval_envs: 16                  # driven at a time in either, all in the run's process
+    eval_envs: 16                  # environments of an evaluation at a time, in the run's process
     save_freq: 5000                # steps between checkpoints
     failures: {kinds: [black, frozen, noise], severity: 3, episodes: 1}   # after that; left out: none
 

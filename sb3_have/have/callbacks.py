@@ -40,7 +40,7 @@ class ModalityWeightsCallback(BaseCallback):
 
     :param read_freq: steps of each environment from one reading to the next
     :param window: readings that mean and histograms are of, like SB3's ``stats_window_size``
-    :param eval_env: id of the environment for the episode, made anew each time, or a (not vectorized) environment; not
+    :param eval_env: id of the environment for the episode, made each time, or a (not vectorized) environment; not
         the one that is trained in. Frame stack and normalisation follow from the training.
     :param episode_freq: steps from one episode to the next, counted over all environments; 0 for none
     :param weather: of the episode, for ids of environments that have the keyword
