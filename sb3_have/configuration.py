@@ -12,6 +12,7 @@ from typing import Any
 
 import gymnasium as gym
 import yaml
+from stable_baselines3.common.utils import LinearSchedule
 
 Env = gym.Env[Any, Any]
 CLASS_OR_WORD = ("policy", "activation_fn", "fusion", "auxiliary")
@@ -87,7 +88,9 @@ def model_kwargs(config: Mapping[str, Any]) -> dict[str, Any]:
     The Zoo does so for ``policy`` alone; in its own format the rest is Python in a string, which it evaluates without
     knowing this package. :mod:`sb3_have.zoo` translates.
 
-    :raises ValueError: if a path leads nowhere
+    ``learning_rate: lin_1e-3`` is the Zoo's schedule: it decays linearly from 1e-3 to 0 over the training.
+
+    :raises ValueError: if a path leads nowhere, or ``learning_rate`` is a word of another form
     """
     for_others = {"n_timesteps", "n_envs", "frame_stack", "env_kwargs", "env_wrapper"}
     return {key: _resolve(key, value) for key, value in config.items() if key not in for_others}
@@ -99,9 +102,24 @@ def _resolve(key: str, value: Any) -> Any:
     if isinstance(value, Mapping):
         inherited = key if is_class or key in CLASS_OR_WORD else None
         return {name: _resolve(inherited or name, item) for name, item in value.items()}
+    if key == "learning_rate" and isinstance(value, str):
+        return _linear_schedule(value)
     if isinstance(value, str) and (is_class or (key in CLASS_OR_WORD and "." in value)):
         return _locate(value, key)
     return deepcopy(value)
+
+
+def _linear_schedule(text: str) -> LinearSchedule:
+    """The schedule of ``lin_<initial value>``."""
+    name, _, initial_value = text.partition("_")
+    try:
+        if name != "lin":
+            raise ValueError(text)
+        return LinearSchedule(float(initial_value), end=0.0, end_fraction=1.0)
+    except ValueError:
+        raise ValueError(
+            f"learning_rate={text!r}: expected a number, or a linear schedule such as 'lin_1e-3'"
+        ) from None
 
 
 def env_wrapper(config: Mapping[str, Any]) -> Callable[[Env], Env] | None:

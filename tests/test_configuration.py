@@ -183,6 +183,14 @@ def test_training_and_its_evaluations_are_wrapped(tmp_path: Path) -> None:
     env.close()
 
 
+def test_learning_rate_decays_as_in_the_zoo() -> None:
+    schedule = model_kwargs({"learning_rate": "lin_1e-3"})["learning_rate"]
+    assert [schedule(remaining) for remaining in (1.0, 0.5, 0.0)] == pytest.approx([1e-3, 5e-4, 0.0])
+    for word in ("log_1e-3", "lin_fast", "fast"):
+        with pytest.raises(ValueError, match=f"learning_rate='{word}': expected a number.*lin_1e-3"):
+            model_kwargs({"learning_rate": word})
+
+
 def test_hyperparameters_of_the_command_line() -> None:
     assert hyperparameter("learning_rate:3e-4") == ("learning_rate", 3e-4)
     for text, value in (("32", 32), ("1e5", 100_000), ("1.0", 1.0), ("0.5", 0.5)):

@@ -127,6 +127,31 @@ def test_resumed_run_is_the_same(
     assert_same(outcome(again, again.train(40)), uninterrupted)
 
 
+def test_resumed_schedule_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The learning rate is that of the whole run, and so are the weights, bit for bit."""
+
+    class Interrupted(train.RunCallback):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 25:
+                os.kill(os.getpid(), signal.SIGINT)
+            return super()._on_step()
+
+    def run(name: str) -> Run:
+        made = make_run(tmp_path / name)
+        made.config["learning_rate"] = "lin_1e-3"
+        return made
+
+    uninterrupted = run("whole")
+    expected = outcome(uninterrupted, uninterrupted.train(40))
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "RunCallback", Interrupted)
+        stopped: Any = run("stopped").train(40)
+    assert stopped.num_timesteps == 25
+    assert stopped.critic.optimizer.param_groups[0]["lr"] == pytest.approx(1e-3 * 15 / 40)
+    resumed = run("stopped")
+    assert_same(outcome(resumed, resumed.train(40)), expected)
+
+
 def test_evaluations_do_not_disturb(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, uninterrupted: dict[str, Any]
 ) -> None:
