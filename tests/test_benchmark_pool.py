@@ -85,7 +85,7 @@ def test_benchmark_survives_sigterm_sigkill_and_a_dead_worker(tmp_path: Path, mo
         process = start()
         wait_until(lambda: all(steps(name) > stopped[name] for name in names), process)
         os.kill(pids_of_runs(process.pid)[0], signal.SIGKILL)
-        wait_until(lambda: "goes on from its checkpoint, attempt 2 of 3" in log.read_text(), process)
+        wait_until(lambda: "resuming from its checkpoint, attempt 2 of 3" in log.read_text(), process)
         known = {name: steps(name) for name in names}
         wait_until(lambda: all(steps(name) > known[name] for name in names), process)
         for pid in processes_of_session(process.pid):

@@ -133,12 +133,12 @@ class Runner:
         path.write_text(f"{reason}\n")
         self._attempts[job.name] += 1
         attempt, attempts = self._attempts[job.name], self.retries + 1
-        told = f"{job.name} died ({reason.splitlines()[-1]})"
+        last_line = reason.splitlines()[-1]
         if attempt == attempts:
             self.failed.append(job.name)
-            return f"{told} for the {attempt}. time, and is left; see {path}"
+            return f"{job.name} died ({last_line}): failed {attempt} times, giving up; see {path}"
         self._todo.appendleft(job)
-        return f"{told} and goes on from its checkpoint, attempt {attempt + 1} of {attempts}"
+        return f"{job.name} died ({last_line}): resuming from its checkpoint, attempt {attempt + 1} of {attempts}"
 
     def _steps(self) -> int:
         """Done by all runs; after the last one a run still evaluates."""

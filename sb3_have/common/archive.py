@@ -127,7 +127,7 @@ def _set_aside(array: pickle.PickleBuffer, arrays: list[pickle.PickleBuffer]) ->
 
 
 def _sync_folder(folder: Path) -> None:
-    """Without this the new name may be lost with the power; some network file systems cannot, and then it is so."""
+    """Fsync the folder so that the rename survives a power failure, where the file system supports it."""
     if hasattr(os, "O_DIRECTORY"):  # not on Windows
         with suppress(OSError):
             handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

@@ -259,11 +259,11 @@ _locks: dict[Path, ExitStack] = {}
 
 class ResumableCheckpointCallback(BaseCallback):
     """
-    Saves checkpoints as a training goes, from which :func:`load_checkpoint` lets it go on exactly.
+    Callback for saving checkpoints, from which :func:`load_checkpoint` resumes the training exactly.
 
-    First in a list of callbacks, it lets no ``_on_rollout_start`` be run twice where the training goes on. The state of
-    all callbacks of the training is saved. A checkpoint that cannot be written is told by a warning. Within another
-    callback (``EveryNTimesteps``) it would not be told of rollouts, and is refused; so are on-policy algorithms.
+    Put it first, so that no callback's ``_on_rollout_start`` runs twice after resuming. The state of all callbacks is
+    saved. If a checkpoint cannot be written, a warning says so. Inside another callback (``EveryNTimesteps``) it would
+    miss the rollouts, so it is refused there; on-policy algorithms are refused too.
 
     :param folder: for ``checkpoint-<step>`` of this training alone: one that has later checkpoints than the training
         has steps is refused, and so is one in which another process trains, or has been interrupted and lives on

@@ -43,7 +43,7 @@ def evaluate(
         pass rounds differently in batches of different sizes, by 1e-7 of an action, which may grow over an episode
     :param env_kwargs: further keywords for ``gym.make``, the same as in training
     :param n_envs: environments at a time, with one ``predict`` for all of them
-    :param deterministic: whether the policy's mode is driven rather than a sample of it
+    :param deterministic: Whether to use deterministic actions
     :param progress_bar: shown per episode, within a training below that of SB3's ``learn``
     :param env_wrapper: applied to every environment, e.g. ``partial(SensorFailure, modality="rgb", kind="black",
         severity=3)``; a function or class that can be pickled if ``vec_env_cls`` is ``SubprocVecEnv``

@@ -85,7 +85,7 @@ def record_episode(
     :param env_kwargs: further keywords for ``gym.make``, the same as in training
     :param max_steps: to record at most
     :param env_wrapper: applied to the environment, e.g. ``partial(SensorFailure, modality="rgb", kind="black")``
-    :param deterministic: whether the policy's mode is driven rather than a sample of it
+    :param deterministic: Whether to use deterministic actions
     :param render: whether to keep the environment's own pictures, if it can give them: a film shows them beside the
         images of the sensors
     :param progress_bar: shown per step

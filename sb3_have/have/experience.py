@@ -1,4 +1,4 @@
-"""The side of HAVESAC that faces the environment: where transitions are stored, and which are refused."""
+"""Replay buffer setup and input validation for HAVESAC."""
 
 import io
 import pathlib
@@ -18,9 +18,9 @@ from sb3_have.have.policies import check_observation, check_stored_observation
 
 class SensorSAC(SAC):
     """
-    SAC whose replay buffer is by default a :class:`~sb3_have.ModalityReplayBuffer` where there are images or n-step
-    returns, told of frame stack, ``n_steps`` and ``gamma``; observations and rewards that are not finite do not reach
-    it. The parameters are SAC's.
+    SAC that creates a :class:`~sb3_have.ModalityReplayBuffer` by default for images and for n-step returns, with the
+    environment's frame stack, ``n_steps`` and ``gamma``, and that refuses observations and rewards that are not finite.
+    The parameters are SAC's.
     """
 
     n_stack = 1
