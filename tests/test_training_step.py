@@ -101,6 +101,11 @@ def test_what_cannot_be_read_in_blocks_is_read_in_pixels(
     assert ImageEncoder(spaces.Box(0, 255, (3, size, size), np.uint8), 4, [layer]).block_size == 1
 
 
+def test_an_encoder_without_convolutions() -> None:
+    encoder = ImageEncoder(spaces.Box(0, 255, (3, 8, 8), np.uint8), 4, layers=[])
+    assert encoder.block_size == 1 and encoder(th.zeros(2, 3, 8, 8)).shape == (2, 4)
+
+
 def test_grouped_images_and_own_encoders_are_read_in_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     """A subclass may expect pixels, and the channels of two images are joined behind one another."""
 

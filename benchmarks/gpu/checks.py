@@ -94,7 +94,7 @@ class Setting:
 
 @contextmanager
 def same_noise() -> Iterator[None]:
-    """Actions are drawn with the same noise on every device, each of which has its own generator."""
+    """Draw actions with the same noise on every device, although each device has a generator of its own."""
     generator = th.Generator().manual_seed(0)
 
     def rsample(self: Normal, sample_shape: Any = ()) -> th.Tensor:

@@ -49,7 +49,7 @@ class ImageEncoder(nn.Module):
             modules += [conv_class(channels, filters, kernel_size, stride), nn.ReLU(inplace=True)]
             channels = filters
         self.convolutions = nn.Sequential(*modules)
-        _, kernel_size, stride = layers[0]
+        _, kernel_size, stride = layers[0] if layers else (0, 1, 1)
         fits = kernel_size > stride and kernel_size % stride == height % stride == width % stride == 0
         # Side of the blocks of pixels in which :class:`BlockConv2d` reads the images fastest; 1 where it is pixels.
         self.block_size = stride if fits and stride in (2, 4, 8) and has_avx512() else 1
