@@ -17,9 +17,9 @@ import gymnasium as gym
 import pandas as pd
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from sb3_have.benchmark.grid import Grid, read_grid
+from sb3_have.benchmark.grid import FINAL_SEED, Grid, read_grid
 from sb3_have.benchmark.reading import FILES
-from sb3_have.benchmark.stages import DIGITS, FINAL_SEED
+from sb3_have.benchmark.stages import DIGITS
 from sb3_have.common.drivers import KeepStraightDriver, RandomDriver
 from sb3_have.common.episodes import Predictor
 from sb3_have.common.evaluation import evaluate

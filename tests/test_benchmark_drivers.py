@@ -6,9 +6,8 @@ import pytest
 import yaml
 
 from benchmarks import drivers
-from sb3_have.benchmark.grid import read_grid
+from sb3_have.benchmark.grid import FINAL_SEED, read_grid
 from sb3_have.benchmark.reading import read_csv
-from sb3_have.benchmark.stages import FINAL_SEED
 from sb3_have.common.drivers import KeepStraightDriver
 from sb3_have.common.evaluation import evaluate_episodes
 

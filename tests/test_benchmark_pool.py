@@ -16,10 +16,11 @@ from fake_drive import ENV_ID
 from tiny_grid import LocalPool, make_grid, read
 
 from sb3_have.benchmark import stages
+from sb3_have.benchmark.grid import FINAL_SEED
 from sb3_have.benchmark.reading import read_results
 from sb3_have.benchmark.results import is_finished
 from sb3_have.benchmark.runner import FINISHED, STOPPED, Runner
-from sb3_have.benchmark.stages import FINAL_SEED, run_job
+from sb3_have.benchmark.stages import run_job
 from sb3_have.common.evaluation import evaluate_episodes
 from sb3_have.train import algorithms, checkpoint_step, newest_checkpoint
 

@@ -16,10 +16,11 @@ from tiny_grid import FAILURES, TINY, make_grid, read
 
 from sb3_have import HAVESAC, train
 from sb3_have.benchmark import stages
-from sb3_have.benchmark.grid import Job
+from sb3_have.benchmark.grid import FINAL_SEED, Job
 from sb3_have.benchmark.results import is_finished, merge
-from sb3_have.benchmark.stages import FINAL_SEED, collect, run_job
+from sb3_have.benchmark.stages import collect, run_job
 from sb3_have.common.episodes import Task
+from sb3_have.common.evaluation import episode_tasks
 from sb3_have.train import EVALUATION_SEED, Run, newest_checkpoint
 
 
@@ -173,3 +174,13 @@ def test_parameters_are_those_that_are_trained() -> None:
     assert heads > 0 and stages.n_parameters(sac) == stages.n_parameters(deepmdp) - heads
     trained = [*deepmdp.critic.parameters(), *deepmdp.actor.parameters(), *deepmdp.policy.auxiliary.parameters()]
     assert stages.n_parameters(deepmdp) == sum(parameter.numel() for parameter in trained)
+
+
+def test_final_seed_of_a_grid(tmp_path: Path) -> None:
+    """A search drives other episodes than the tables, and its runs are not taken for theirs."""
+    ours, theirs = make_grid(tmp_path, final_seed=7).jobs()[0], make_grid(tmp_path).jobs()[0]
+    run_job(ours, tmp_path / "runs")
+    episodes = pd.read_csv(tmp_path / "runs" / ours.name / "final-30" / "episodes.csv")
+    assert set(episodes["episode_seed"]) == {task.seed for task in episode_tasks(["slow", "fast"], 3, seed=7)}
+    with pytest.raises(ValueError, match="final_seed"):
+        run_job(theirs, tmp_path / "runs")

@@ -12,6 +12,7 @@ A grid is a YAML file; only ``methods`` and ``seeds`` have to be there::
     eval_freq: 5000                # steps between the points of the learning curve, 0 for none
     eval_episodes: 1               # of a point, in each weather
     final_episodes: 10             # after training, in each weather
+    final_seed: 2000000            # of the first of those; a search takes others than the tables
     eval_envs: 16                  # environments of an evaluation at a time, in the run's process
     save_freq: 5000                # steps between checkpoints
     failures: {kinds: [black, frozen, noise], severity: 3, episodes: 1}   # after that; left out: none
@@ -40,6 +41,10 @@ from sb3_have.configuration import config_path, load_config
 from sb3_have.envs.weather import WEATHERS
 from sb3_have.sensors import SENSORS, failures_for
 from sb3_have.train import algorithm_of, algorithms
+
+FINAL_SEED = 2_000_000
+"""Seed of the first episode after training, the same for all methods and seeds. No run is trained on these episodes
+or chosen by them (:data:`sb3_have.train.EVALUATION_SEED`)."""
 
 NOT_OF_THE_MODEL = {"n_envs", "frame_stack", "env_kwargs", "env_wrapper"}
 OWN_ENVS = ("HighwayVision-v0", "CarlaVision-v0")
@@ -78,6 +83,7 @@ class Grid:
     eval_freq: int = 5_000
     eval_episodes: int = 1
     final_episodes: int = 10
+    final_seed: int = FINAL_SEED
     eval_envs: int = 16
     save_freq: int = 5_000
     failures: Failures | None = None
@@ -154,6 +160,8 @@ class Job:
     def settings(self) -> dict[str, Any]:
         """All that decides on a run's results but its seed, its steps and the failures of its sensors."""
         settings = {**self.config, "algo": self.algo, "env_id": self.grid.env}
+        if self.grid.final_seed != FINAL_SEED:
+            settings["final_seed"] = self.grid.final_seed
         return dict(json.loads(json.dumps(settings, sort_keys=True)))
 
 
@@ -356,6 +364,7 @@ GRID_KEYS: dict[str, Reader] = {
     "eval_episodes": _whole(1),
     "eval_envs": _whole(1),
     "final_episodes": _whole(1),
+    "final_seed": _whole(0),
     "save_freq": _whole(0),
     "failures": _failures,
 }

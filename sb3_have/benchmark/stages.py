@@ -38,10 +38,6 @@ from sb3_have.configuration import Env, env_wrapper, evaluation_env_kwargs
 from sb3_have.sensors import SENSORS, SensorFailure, failures_for
 from sb3_have.train import Run, algorithms
 
-FINAL_SEED = 2_000_000
-"""Of the episodes after training: the same for all methods and seeds, and none that a run was trained or chosen by
-(:data:`sb3_have.train.EVALUATION_SEED`)."""
-
 DIGITS = 4
 LOCK_SECONDS = 60.0
 """How long to wait for a process that is just dying."""
@@ -168,7 +164,7 @@ def drive_finally(job: Job, model: OffPolicyAlgorithm, folder: Path) -> None:
     grid, path = job.grid, final_folder(job, folder) / "episodes.csv"
     missing = [w for w in grid.weathers if len(_rows_of(path, weather=w)) != grid.final_episodes]
     if missing:
-        tasks = episode_tasks(missing, grid.final_episodes, FINAL_SEED, partial(_wrapped, config=job.config))
+        tasks = episode_tasks(missing, grid.final_episodes, grid.final_seed, partial(_wrapped, config=job.config))
         tasks.sort(key=lambda task: missing.index(task.weather))
         _replace(path, _drive(job, model, tasks), [{"weather": weather} for weather in missing])
 
@@ -239,7 +235,7 @@ def break_sensors(job: Job, model: OffPolicyAlgorithm, folder: Path, failures: F
     for weather, case in missing:
         if case != HEALTHY:
             wrapper = partial(_wrapped, config=job.config, failure=case)
-            tasks += episode_tasks([weather], n_episodes, FINAL_SEED, wrapper)
+            tasks += episode_tasks([weather], n_episodes, job.grid.final_seed, wrapper)
     driven, rows = _drive(job, model, tasks) if tasks else pd.DataFrame(), []
     for weather, case in missing:
         if case == HEALTHY:
