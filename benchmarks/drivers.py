@@ -20,11 +20,11 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from sb3_have.benchmark.grid import FINAL_SEED, Grid, read_grid
 from sb3_have.benchmark.reading import FILES
 from sb3_have.benchmark.stages import DIGITS
-from sb3_have.common.drivers import KeepStraightDriver, RandomDriver
-from sb3_have.common.episodes import Predictor
-from sb3_have.common.evaluation import evaluate
-from sb3_have.common.files import write_atomically
+from sb3_have.checkpoint.files import write_atomically
 from sb3_have.configuration import evaluation_env_kwargs
+from sb3_have.envs.drivers import KeepStraightDriver, RandomDriver
+from sb3_have.evaluation.episodes import Predictor
+from sb3_have.evaluation.evaluation import evaluate
 
 IDM_ID = "benchmarks.drivers:RuleDriven-v0"
 """HighwayVision-v0 that drives by itself; the module in front registers it in processes of its own too."""

@@ -24,9 +24,9 @@ from gymnasium import spaces
 
 from benchmarks.measure import RESULTS, machine
 from sb3_have import HAVESAC
-from sb3_have.common.evaluation import evaluate_episodes
 from sb3_have.configuration import Env, env_wrapper, evaluation_env_kwargs, load_config
 from sb3_have.envs.weather import WEATHERS
+from sb3_have.evaluation.evaluation import evaluate_episodes
 from sb3_have.sensors import SENSORS, SensorFailure, failures_for
 
 NONE = ("none", "none", 0)
@@ -66,7 +66,7 @@ def drive(
     :param n_episodes: in each weather
     :param seed: of the episodes
     :param inner: wrapper of the training, see :func:`~sb3_have.configuration.env_wrapper`
-    :param kwargs: further ones of :func:`~sb3_have.common.evaluation.evaluate_episodes`
+    :param kwargs: further ones of :func:`~sb3_have.evaluation.evaluation.evaluate_episodes`
     """
     modality, kind, severity = case
     wrapper = partial(wrapped, inner=inner, case=case)

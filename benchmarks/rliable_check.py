@@ -1,4 +1,4 @@
-"""rliable's figures for a few tables of scores, which the statistics of ``sb3_have.common.evaluation`` must agree with.
+"""rliable's figures for a few tables of scores, with which our statistics must agree.
 
 rliable (https://github.com/google-research/rliable) is the reference implementation of Agarwal et al. 2021. It depends
 on much that nothing else here needs, so its figures are committed, and `tests/test_statistics.py` compares with them.

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 from sb3_have import envs as envs  # registers the environments
 
 if TYPE_CHECKING:
+    from sb3_have.checkpoint.checkpoint import ResumableCheckpointCallback, load_checkpoint, save_checkpoint
     from sb3_have.common.buffers import ModalityReplayBuffer
-    from sb3_have.common.checkpoint import ResumableCheckpointCallback, load_checkpoint, save_checkpoint
-    from sb3_have.common.evaluation import evaluate
-    from sb3_have.common.recording import Recording, record_episode
+    from sb3_have.evaluation.evaluation import evaluate
+    from sb3_have.evaluation.recording import Recording, record_episode
     from sb3_have.export import export_onnx, export_safetensors, load_policy
     from sb3_have.have import HAVESAC, DeepMDPCallback, ModalityWeightsCallback, MultiModalCritic, MultiModalPolicy
 
@@ -47,17 +47,17 @@ _MODULES = {
     "ModalityWeightsCallback": "have",
     "MultiModalCritic": "have",
     "MultiModalPolicy": "have",
-    "Recording": "common.recording",
-    "ResumableCheckpointCallback": "common.checkpoint",
-    "evaluate": "common.evaluation",
+    "Recording": "evaluation.recording",
+    "ResumableCheckpointCallback": "checkpoint.checkpoint",
+    "evaluate": "evaluation.evaluation",
     "export_onnx": "export",
     "export_safetensors": "export",
-    "load_checkpoint": "common.checkpoint",
+    "load_checkpoint": "checkpoint.checkpoint",
     "load_policy": "export",
-    "record_episode": "common.recording",
-    "save_checkpoint": "common.checkpoint",
+    "record_episode": "evaluation.recording",
+    "save_checkpoint": "checkpoint.checkpoint",
 }
-_PACKAGES = ("common", "export", "have", "plotting", "sensors")
+_PACKAGES = ("checkpoint", "common", "evaluation", "export", "have", "plotting", "sensors")
 
 
 def __getattr__(name: str) -> Any:

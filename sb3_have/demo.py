@@ -21,13 +21,13 @@ import torch as th
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
-from sb3_have.common.drivers import KeepStraightDriver, RandomDriver
-from sb3_have.common.episodes import Predictor
-from sb3_have.common.evaluation import evaluate, format_table
 from sb3_have.common.memory import keep_freed_memory
-from sb3_have.common.recording import record_episode
 from sb3_have.configuration import evaluation_env_kwargs, load_config
+from sb3_have.envs.drivers import KeepStraightDriver, RandomDriver
 from sb3_have.envs.weather import WEATHERS
+from sb3_have.evaluation.episodes import Predictor
+from sb3_have.evaluation.evaluation import evaluate, format_table
+from sb3_have.evaluation.recording import record_episode
 from sb3_have.plotting import plot_learning_curve, plot_modality_weights, write_gif
 from sb3_have.train import Run
 

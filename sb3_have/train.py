@@ -5,7 +5,7 @@
 The same command resumes. The folder holds ``monitor.csv`` (training episodes), ``evaluation.csv`` (a row per weather
 at every evaluation), ``log-<first step>/progress.csv`` (SB3's log), the newest two ``checkpoint-<step>`` and
 ``model.zip``. A resumed run goes on in the middle of its episodes; on a CPU it ends with the bits of an uninterrupted
-one (:mod:`sb3_have.common.checkpoint`).
+one (:mod:`sb3_have.checkpoint.checkpoint`).
 """
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack
 
 import sb3_have
-from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
-from sb3_have.common.checkpoint import (
+from sb3_have.checkpoint.checkpoint import (
     checkpoint_info,
     checkpoints,
     load_checkpoint,
@@ -37,16 +36,17 @@ from sb3_have.common.checkpoint import (
     same_random_numbers,
     write_checkpoint,
 )
-from sb3_have.common.checkpoint import checkpoint_step as checkpoint_step
-from sb3_have.common.checkpoint import newest_checkpoint as newest_checkpoint
+from sb3_have.checkpoint.checkpoint import checkpoint_step as checkpoint_step
+from sb3_have.checkpoint.checkpoint import newest_checkpoint as newest_checkpoint
+from sb3_have.checkpoint.env_state import ResumableEnv
+from sb3_have.checkpoint.files import locked, write_atomically
+from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
 from sb3_have.common.crossq import MultiInputCrossQ
-from sb3_have.common.env_state import ResumableEnv
-from sb3_have.common.episodes import leave_interrupts_to_parent
-from sb3_have.common.evaluation import evaluate
-from sb3_have.common.files import locked, write_atomically
 from sb3_have.common.memory import keep_freed_memory
 from sb3_have.configuration import env_wrapper, evaluation_env_kwargs, hyperparameter, load_config, model_kwargs
 from sb3_have.envs.weather import WEATHERS
+from sb3_have.evaluation.episodes import leave_interrupts_to_parent
+from sb3_have.evaluation.evaluation import evaluate
 from sb3_have.run_callback import RunCallback as RunCallback
 from sb3_have.run_callback import TrainingStopped, is_due
 
@@ -255,7 +255,7 @@ class Run:
             write_atomically(path, partial(Path.write_text, data="".join([head, *lines[: kept + 1]])))
 
     def save(self, model: Any, rollout_started: bool = False) -> None:
-        """Write ``checkpoint-<step>``, unless it has been; see :func:`~sb3_have.common.checkpoint.save_checkpoint`."""
+        """Write ``checkpoint-<step>``, unless it exists already."""
         if model.num_timesteps != self._saved_step:  # a file of that name may be a damaged one
             info = {"seconds": self.seconds, "settings": self._settings()}
             if write_checkpoint(self.out, model, KEPT_CHECKPOINTS, info=info, rollout_started=rollout_started):

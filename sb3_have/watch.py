@@ -25,13 +25,13 @@ from gymnasium import spaces
 from gymnasium.error import Error as GymnasiumError
 from stable_baselines3.common.base_class import BaseAlgorithm
 
-from sb3_have.common.archive import DamagedCheckpointError
-from sb3_have.common.checkpoint import checkpoint_info, checkpoints
-from sb3_have.common.recording import Recording, record_episode
-from sb3_have.common.saved_algorithm import saved_algorithm
-from sb3_have.common.wrapping import saved_normalizer
+from sb3_have.checkpoint.archive import DamagedCheckpointError
+from sb3_have.checkpoint.checkpoint import checkpoint_info, checkpoints
+from sb3_have.checkpoint.saved_algorithm import saved_algorithm
 from sb3_have.configuration import env_wrapper, hyperparameter, load_config
 from sb3_have.envs.vision import MODALITIES
+from sb3_have.evaluation.recording import Recording, record_episode
+from sb3_have.evaluation.wrapping import saved_normalizer
 from sb3_have.plotting import write_animation
 from sb3_have.train import algorithms
 

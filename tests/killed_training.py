@@ -15,8 +15,8 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
-from sb3_have.common import archive
-from sb3_have.common.checkpoint import ResumableCheckpointCallback, checkpoints, load_checkpoint
+from sb3_have.checkpoint import archive
+from sb3_have.checkpoint.checkpoint import ResumableCheckpointCallback, checkpoints, load_checkpoint
 
 STEPS, SAVE_FREQ = 240, 10
 MINUTES = 10

@@ -8,8 +8,8 @@ import yaml
 from benchmarks import drivers
 from sb3_have.benchmark.grid import FINAL_SEED, read_grid
 from sb3_have.benchmark.reading import read_csv
-from sb3_have.common.drivers import KeepStraightDriver
-from sb3_have.common.evaluation import evaluate_episodes
+from sb3_have.envs.drivers import KeepStraightDriver
+from sb3_have.evaluation.evaluation import evaluate_episodes
 
 
 def write_grid(folder: Path, **changes: object) -> Path:

@@ -11,7 +11,7 @@ from sb3_have.benchmark.grid import GridError
 from sb3_have.benchmark.reading import read_results
 from sb3_have.benchmark.results import difference, is_finished, merge
 from sb3_have.benchmark.stages import collect, run_job
-from sb3_have.common import files
+from sb3_have.checkpoint import files
 
 
 def test_results_of_other_settings_are_refused(tmp_path: Path) -> None:

@@ -19,8 +19,8 @@ from sb3_have.benchmark import stages
 from sb3_have.benchmark.grid import FINAL_SEED, Job
 from sb3_have.benchmark.results import is_finished, merge
 from sb3_have.benchmark.stages import collect, run_job
-from sb3_have.common.episodes import Task
-from sb3_have.common.evaluation import episode_tasks
+from sb3_have.evaluation.episodes import Task
+from sb3_have.evaluation.evaluation import episode_tasks
 from sb3_have.train import EVALUATION_SEED, Run, newest_checkpoint
 
 

@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack,
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from sb3_have import HAVESAC
-from sb3_have.common.recording import record_episode
+from sb3_have.evaluation.recording import record_episode
 from sb3_have.have import ModalityWeightsCallback
 
 

@@ -20,9 +20,9 @@ from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize
 
 from sb3_have import HAVESAC, DeepMDPCallback
-from sb3_have.common.checkpoint import ResumableCheckpointCallback, checkpoints, load_checkpoint, save_checkpoint
+from sb3_have.checkpoint.checkpoint import ResumableCheckpointCallback, checkpoints, load_checkpoint, save_checkpoint
+from sb3_have.checkpoint.env_state import ResumableEnv, environments_state, restore_environments
 from sb3_have.common.crossq import MultiInputCrossQ
-from sb3_have.common.env_state import ResumableEnv, environments_state, restore_environments
 
 
 def sac(env: Any, algorithm: Any = SAC, policy: str = "MlpPolicy", **kwargs: Any) -> Any:
@@ -119,7 +119,7 @@ def test_schedules_go_on(tmp_path: Path) -> None:
 @pytest.fixture
 def warm_workers() -> None:
     """Worker processes import what they need once for all."""
-    multiprocessing.get_context("forkserver").set_forkserver_preload(["resuming", "sb3_have.common.env_state"])
+    multiprocessing.get_context("forkserver").set_forkserver_preload(["resuming", "sb3_have.checkpoint.env_state"])
 
 
 @pytest.mark.usefixtures("warm_workers")

@@ -19,8 +19,8 @@ from stable_baselines3.common.callbacks import EveryNTimesteps
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_have.common.archive import DamagedCheckpointError, check_archive, dumps, loads, read_archive, write_archive
-from sb3_have.common.checkpoint import (
+from sb3_have.checkpoint.archive import DamagedCheckpointError, check_archive, dumps, loads, read_archive, write_archive
+from sb3_have.checkpoint.checkpoint import (
     ResumableCheckpointCallback,
     checkpoint_info,
     load_checkpoint,

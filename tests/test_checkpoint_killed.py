@@ -13,8 +13,8 @@ import pytest
 from killed_training import SAVE_FREQ, STEPS
 from resuming import assert_same, everything
 
-from sb3_have.common.archive import check_archive
-from sb3_have.common.checkpoint import checkpoint_step, checkpoints
+from sb3_have.checkpoint.archive import check_archive
+from sb3_have.checkpoint.checkpoint import checkpoint_step, checkpoints
 
 N_KILLS = 20
 

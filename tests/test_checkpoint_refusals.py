@@ -21,8 +21,8 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_have.common import checkpoint, files
-from sb3_have.common.checkpoint import (
+from sb3_have.checkpoint import checkpoint, files
+from sb3_have.checkpoint.checkpoint import (
     ResumableCheckpointCallback,
     checkpoints,
     load_checkpoint,
@@ -30,7 +30,7 @@ from sb3_have.common.checkpoint import (
     save_checkpoint,
     set_random_states,
 )
-from sb3_have.common.env_state import environments_state, restore_environments
+from sb3_have.checkpoint.env_state import environments_state, restore_environments
 
 
 def make_model(env: Any = None, algorithm: Any = SAC, **kwargs: Any) -> Any:

@@ -15,9 +15,7 @@ from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_have import ModalityReplayBuffer, MultiModalPolicy, train
-from sb3_have.common.drivers import RandomDriver
 from sb3_have.common.encoders import ImageEncoder
-from sb3_have.common.evaluation import evaluate_episodes
 from sb3_have.configuration import (
     config_path,
     env_wrapper,
@@ -25,6 +23,8 @@ from sb3_have.configuration import (
     load_config,
     model_kwargs,
 )
+from sb3_have.envs.drivers import RandomDriver
+from sb3_have.evaluation.evaluation import evaluate_episodes
 from sb3_have.have.deepmdp import DeepMDP
 from sb3_have.train import Run
 

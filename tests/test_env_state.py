@@ -24,8 +24,8 @@ from stable_baselines3.common.callbacks import (
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
-from sb3_have.common.checkpoint import load_checkpoint, save_checkpoint
-from sb3_have.common.env_state import ResumableEnv, environments_state, restore_environments
+from sb3_have.checkpoint.checkpoint import load_checkpoint, save_checkpoint
+from sb3_have.checkpoint.env_state import ResumableEnv, environments_state, restore_environments
 
 
 class Connected(Drifting):

@@ -21,9 +21,9 @@ from stable_baselines3.common.vec_env import (
     VecTransposeImage,
 )
 
-from sb3_have.common.drivers import KeepStraightDriver, RandomDriver
-from sb3_have.common.episodes import match_observations
-from sb3_have.common.evaluation import evaluate, evaluate_episodes, format_table
+from sb3_have.envs.drivers import KeepStraightDriver, RandomDriver
+from sb3_have.evaluation.episodes import match_observations
+from sb3_have.evaluation.evaluation import evaluate, evaluate_episodes, format_table
 
 WEATHERS = ("slow", "fast")
 

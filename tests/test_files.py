@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from sb3_have.common.files import write_atomically
+from sb3_have.checkpoint.files import write_atomically
 
 
 @pytest.mark.parametrize("error", [OSError("no space left"), KeyboardInterrupt()])

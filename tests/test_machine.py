@@ -10,8 +10,8 @@ import gymnasium
 import pytest
 
 import sb3_have
-from sb3_have.common import machine as module
-from sb3_have.common.machine import commit_of, machine
+from sb3_have.benchmark import machine as module
+from sb3_have.benchmark.machine import commit_of, machine
 
 
 def test_versions_name_what_results_depend_on(monkeypatch: pytest.MonkeyPatch) -> None:

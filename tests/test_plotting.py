@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from PIL import Image
 
-from sb3_have.common.drivers import KeepStraightDriver
-from sb3_have.common.recording import Recording, record_episode
+from sb3_have.envs.drivers import KeepStraightDriver
+from sb3_have.evaluation.recording import Recording, record_episode
 from sb3_have.plotting import Frames, modality_colours, plot_learning_curve, plot_modality_weights, write_gif
 from sb3_have.plotting.episode import images
 

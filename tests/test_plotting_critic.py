@@ -9,7 +9,7 @@ from matplotlib.colors import to_hex
 from matplotlib.container import BarContainer
 from matplotlib.contour import ContourSet
 
-from sb3_have.common.recording import Recording, record_episode
+from sb3_have.evaluation.recording import Recording, record_episode
 from sb3_have.plotting import (
     modality_colours,
     modality_styles,

@@ -16,10 +16,10 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from sb3_have import HAVESAC
-from sb3_have.common.checkpoint import save_checkpoint
-from sb3_have.common.drivers import RandomDriver
-from sb3_have.common.recording import Recording, record_episode
-from sb3_have.common.wrapping import saved_normalizer
+from sb3_have.checkpoint.checkpoint import save_checkpoint
+from sb3_have.envs.drivers import RandomDriver
+from sb3_have.evaluation.recording import Recording, record_episode
+from sb3_have.evaluation.wrapping import saved_normalizer
 
 
 def of_step(recording: Recording, step: int) -> dict[str, np.ndarray]:

@@ -13,8 +13,8 @@ from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv, SimpleMultiObsEnv
 
 from sb3_have import ModalityReplayBuffer
-from sb3_have.common.checkpoint import load_checkpoint, save_checkpoint
-from sb3_have.common.replay_state import at_full_size, end_last_episode, filled_part
+from sb3_have.checkpoint.checkpoint import load_checkpoint, save_checkpoint
+from sb3_have.checkpoint.replay_state import at_full_size, end_last_episode, filled_part
 
 KINDS: dict[str, tuple[type[ReplayBuffer], dict[str, Any]]] = {
     "n steps": (NStepReplayBuffer, {"n_steps": 3, "gamma": 1.0}),

@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from sb3_have.common import evaluation
-from sb3_have.common.evaluation import (
+from sb3_have.evaluation import evaluation
+from sb3_have.evaluation.evaluation import (
     iqm,
     mean,
     median,

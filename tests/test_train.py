@@ -19,8 +19,8 @@ from resuming import assert_same, everything, leaves
 
 import sb3_have
 from sb3_have import train
-from sb3_have.common import files
-from sb3_have.common.checkpoint import save_checkpoint
+from sb3_have.checkpoint import files
+from sb3_have.checkpoint.checkpoint import save_checkpoint
 from sb3_have.configuration import load_config, model_kwargs
 from sb3_have.train import Run, make_training_env, newest_checkpoint
 

@@ -25,7 +25,7 @@ from pathlib import Path
 import pandas as pd
 
 from benchmarks.measure import RESULTS, Row, machine, save, show
-from sb3_have.common.checkpoint import checkpoint_info, checkpoints
+from sb3_have.checkpoint.checkpoint import checkpoint_info, checkpoints
 
 CONFIGS = ("have", "lve", "gve", "rgb", "event")
 LAST_EPISODES = 10

@@ -14,7 +14,7 @@ from matplotlib.ticker import EngFormatter
 from sb3_have.benchmark.breakdown import cases_of
 from sb3_have.benchmark.reading import DISTANCE, Measure, Results, ordered
 from sb3_have.benchmark.tables import score_table
-from sb3_have.common.evaluation import performance_profile
+from sb3_have.evaluation.evaluation import performance_profile
 from sb3_have.plotting import weather as weather_figures
 from sb3_have.plotting.learning import whole_evaluations
 from sb3_have.plotting.style import (

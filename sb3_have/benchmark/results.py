@@ -11,7 +11,7 @@ import pandas as pd
 
 from sb3_have.benchmark.grid import GridError, Job
 from sb3_have.benchmark.reading import FILES
-from sb3_have.common.files import write_atomically
+from sb3_have.checkpoint.files import write_atomically
 
 RUN_FILES = ("evaluations", "final", "episodes", "weights", "failures", "runs")
 """What a run adds to, in the order of writing: the row in ``runs.csv`` says that the others are there."""

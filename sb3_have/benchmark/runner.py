@@ -26,7 +26,7 @@ from sb3_have.benchmark.grid import Grid, GridError, Job, read_grid
 from sb3_have.benchmark.pool import RayPool
 from sb3_have.benchmark.results import is_finished, merge
 from sb3_have.benchmark.stages import collect, steps_done
-from sb3_have.common.files import locked
+from sb3_have.checkpoint.files import locked
 
 RETRIES = 2
 REFRESH_SECONDS = 2.0

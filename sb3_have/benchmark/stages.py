@@ -27,14 +27,14 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_have import HAVESAC
 from sb3_have.benchmark.grid import Failures, Job
+from sb3_have.benchmark.machine import machine
 from sb3_have.benchmark.reading import FILES
 from sb3_have.benchmark.results import difference, read_text_table, settings_column
-from sb3_have.common.checkpoint import checkpoint_step, checkpoints
-from sb3_have.common.episodes import EpisodeQueue, Task, match_observations
-from sb3_have.common.evaluation import drive_tasks, episode_tasks, summarize
-from sb3_have.common.files import locked, write_atomically
-from sb3_have.common.machine import machine
+from sb3_have.checkpoint.checkpoint import checkpoint_step, checkpoints
+from sb3_have.checkpoint.files import locked, write_atomically
 from sb3_have.configuration import Env, env_wrapper, evaluation_env_kwargs
+from sb3_have.evaluation.episodes import EpisodeQueue, Task, match_observations
+from sb3_have.evaluation.evaluation import drive_tasks, episode_tasks, summarize
 from sb3_have.sensors import SENSORS, SensorFailure, failures_for
 from sb3_have.train import Run, algorithms
 

@@ -10,7 +10,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from sb3_have.benchmark.reading import Measure, Results
-from sb3_have.common.evaluation import Interval, iqm, probability_of_improvement, stratified_bootstrap
+from sb3_have.evaluation.evaluation import Interval, iqm, probability_of_improvement, stratified_bootstrap
 
 ALL = "all"
 

@@ -1,1 +1,1 @@
-"""Parts that know nothing of HAVE: encoders, fusion, evaluation, recording."""
+"""Networks and replay memory that several algorithms share; nothing here knows of HAVE, an environment or a file."""

@@ -17,7 +17,7 @@ from pathlib import Path
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_have.common.saved_algorithm import saved_algorithm
+from sb3_have.checkpoint.saved_algorithm import saved_algorithm
 from sb3_have.export.config import NORMALIZED
 from sb3_have.export.onnx import export_onnx
 from sb3_have.export.safetensors import CONFIG_FILE, export_safetensors, load_policy, read_config

@@ -22,8 +22,8 @@ from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
+from sb3_have.checkpoint.files import write_atomically
 from sb3_have.common.encoders import MultiModalEncoder
-from sb3_have.common.files import write_atomically
 from sb3_have.export.config import n_stack, policy_of, space_to_json, versions, warn_of_normalization
 from sb3_have.export.requirements import require
 from sb3_have.have.policies import MultiModalPolicy

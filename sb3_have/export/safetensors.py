@@ -26,7 +26,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.utils import get_device
 
-from sb3_have.common.files import write_atomically
+from sb3_have.checkpoint.files import write_atomically
 from sb3_have.export.config import build, describe, policy_of, warn_of_normalization
 from sb3_have.export.requirements import require
 

@@ -12,8 +12,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 from tqdm import tqdm
 
-from sb3_have.common.files import write_atomically
-from sb3_have.common.recording import Recording
+from sb3_have.checkpoint.files import write_atomically
+from sb3_have.evaluation.recording import Recording
 from sb3_have.plotting.episode import images
 from sb3_have.plotting.style import modality_styles
 

@@ -10,8 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-from sb3_have.common.recording import Recording
 from sb3_have.envs.vision import compose
+from sb3_have.evaluation.recording import Recording
 from sb3_have.plotting.style import MEDIUM, SMALL, Style, modality_styles, position
 
 FUSED = {

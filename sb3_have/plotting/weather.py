@@ -8,7 +8,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from sb3_have.common.recording import Recording
+from sb3_have.evaluation.recording import Recording
 from sb3_have.plotting.style import MEDIUM, SMALL, Style, draw_whiskers, legend_above, modality_styles
 
 EQUAL = "equal weights"

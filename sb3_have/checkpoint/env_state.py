@@ -15,7 +15,7 @@ from gymnasium import spaces
 from stable_baselines3.common.monitor import ResultsWriter
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
 
-from sb3_have.common.archive import dumps, loads
+from sb3_have.checkpoint.archive import dumps, loads
 
 NO_STATE = ("spec", "_cached_spec", "render_mode")
 """Attributes of an environment that tell how it was made."""
@@ -54,7 +54,7 @@ class EnvironmentsState(NamedTuple):
         ]
 
 
-OUT_OF_REACH = "environments of SubprocVecEnv whose outermost wrapper is not sb3_have.common.env_state.ResumableEnv"
+OUT_OF_REACH = "environments of SubprocVecEnv whose outermost wrapper is not sb3_have.checkpoint.env_state.ResumableEnv"
 
 
 class ResumableEnv(gym.Wrapper[Any, Any, Any, Any]):
@@ -64,7 +64,7 @@ class ResumableEnv(gym.Wrapper[Any, Any, Any, Any]):
 
         SubprocVecEnv([lambda: ResumableEnv(Monitor(gym.make("HighwayVision-v0")))] * 4)
 
-    and in the Zoo's configurations ``env_wrapper: sb3_have.common.env_state.ResumableEnv``.
+    and in the Zoo's configurations ``env_wrapper: sb3_have.checkpoint.env_state.ResumableEnv``.
     """
 
     def checkpoint_state(self) -> LayersState:

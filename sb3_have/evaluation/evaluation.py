@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 from tqdm import tqdm
 
-from sb3_have.common.episodes import EpisodeQueue, Predictor, Task, drive, match_observations
+from sb3_have.evaluation.episodes import EpisodeQueue, Predictor, Task, drive, match_observations
 
 
 def evaluate(

@@ -18,8 +18,8 @@ from stable_baselines3.common.vec_env import (
 )
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
-from sb3_have.common.archive import loads, read_archive
-from sb3_have.common.episodes import match_observations
+from sb3_have.checkpoint.archive import loads, read_archive
+from sb3_have.evaluation.episodes import match_observations
 
 
 def wrap_as_trained(vec_env: VecEnv, model: Any, normalizer: VecNormalize | None = None) -> VecEnv:
@@ -28,7 +28,7 @@ def wrap_as_trained(vec_env: VecEnv, model: Any, normalizer: VecNormalize | None
     :param vec_env: the bare environment
     :param model: a model that has its training environment, whose ``VecFrameStack``, ``VecNormalize`` (a copy of its
         statistics, which no longer change), ``VecTransposeImage`` and ``VecExtractDictObs`` are put on in the same
-        order; without one, see :func:`~sb3_have.common.episodes.match_observations`
+        order; without one, see :func:`~sb3_have.evaluation.episodes.match_observations`
     :param normalizer: of the training of a model without its environment; see :func:`saved_normalizer`
     :return: rewards are not normalised
     :raises ValueError: if the result has not the observation space of the model, another wrapper of the training

@@ -36,7 +36,7 @@ def _flattened(callbacks: Callbacks) -> list[BaseCallback]:
 
 
 def callbacks_state(callbacks: Callbacks) -> list[tuple[str, Any]]:
-    """Class and state of every callback, see :func:`~sb3_have.common.checkpoint.save_checkpoint`."""
+    """Class and state of every callback, see :func:`~sb3_have.checkpoint.checkpoint.save_checkpoint`."""
     return [(type(each).__qualname__, _callback_state(each)) for each in _flattened(callbacks)]
 
 

@@ -15,8 +15,8 @@ from gymnasium.envs.registration import load_env_creator
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from tqdm import tqdm
 
-from sb3_have.common.episodes import Predictor
-from sb3_have.common.wrapping import wrap_as_trained
+from sb3_have.evaluation.episodes import Predictor
+from sb3_have.evaluation.wrapping import wrap_as_trained
 
 Env = gym.Env[Any, Any]
 
@@ -76,7 +76,7 @@ def record_episode(
 ) -> Recording:
     """Drive an episode and keep it.
 
-    :param model: as for :func:`~sb3_have.common.evaluation.evaluate`, under ``VecNormalize`` too if it has its
+    :param model: as for :func:`~sb3_have.evaluation.evaluation.evaluate`, under ``VecNormalize`` too if it has its
         environment, or ``normalizer`` is given; its ``modality_weights`` and ``critic.decompose``, if any, are recorded
     :param env: id of an environment, or one that was made, which stays open: frame stack and normalisation follow from
         the model

@@ -21,11 +21,11 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_have.common.archive import DamagedCheckpointError, check_archive, read_archive, read_info, write_archive
-from sb3_have.common.callback_state import Callbacks, callbacks_state, restore_callbacks
-from sb3_have.common.env_state import environments_state, restore_environments
-from sb3_have.common.files import locked
-from sb3_have.common.replay_state import at_full_size, end_last_episode, filled_part
+from sb3_have.checkpoint.archive import DamagedCheckpointError, check_archive, read_archive, read_info, write_archive
+from sb3_have.checkpoint.callback_state import Callbacks, callbacks_state, restore_callbacks
+from sb3_have.checkpoint.env_state import environments_state, restore_environments
+from sb3_have.checkpoint.files import locked
+from sb3_have.checkpoint.replay_state import at_full_size, end_last_episode, filled_part
 
 
 def save_checkpoint(
@@ -45,7 +45,7 @@ def save_checkpoint(
     What an environment draws with, and Monitor's file, are made anew. An environment that cannot be pickled otherwise
     (a simulator's connection, a MuJoCo renderer that has drawn) is named in a warning; when the training goes on, its
     episodes begin anew, from its own random numbers, and the rest is exact. ``SubprocVecEnv`` needs
-    :class:`~sb3_have.common.env_state.ResumableEnv` around every environment.
+    :class:`~sb3_have.checkpoint.env_state.ResumableEnv` around every environment.
 
     The right moment is between two calls of ``learn``. In its midst a callback finds the training between two steps of
     its own only at the start of a rollout, see :class:`ResumableCheckpointCallback`; not in ``_on_step``, when the last

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecTranspose
 
 
 class Predictor(Protocol):
-    """An SB3 model or policy, or a :class:`~sb3_have.common.drivers.RuleDriver`."""
+    """An SB3 model or policy, or a :class:`~sb3_have.envs.drivers.RuleDriver`."""
 
     def predict(
         self,
