@@ -29,7 +29,7 @@ import pandas as pd
 
 from benchmarks.measure import RESULTS
 from benchmarks.reliability_report import report
-from benchmarks.reliability_runs import EVALUATION_SEED, METHODS, VARIANTS, run
+from benchmarks.reliability_runs import EVALUATION_SEED, METHODS, REMOVED, VARIANTS, run
 
 DEFAULT_METHODS = ("gve", "gve-wide", "lve", "have", "have-dropout", "have-unsupervised")
 N_UPDATES = 8000
@@ -93,7 +93,7 @@ def _run(method: str, seed: int, n_updates: int, *given: Any) -> list[tuple[str,
 
 def load(folder: Path) -> pd.DataFrame:
     """The rows of all runs in a folder; other tables may lie there too."""
-    files = [folder / f"{method}.csv" for method in (*METHODS, *VARIANTS)]
+    files = [folder / f"{method}.csv" for method in (*METHODS, *VARIANTS, *REMOVED)]
     tables = [pd.read_csv(file) for file in files if file.exists()]
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=COLUMNS)
 

@@ -46,14 +46,14 @@ def test_an_own_loss_is_trained_and_logged() -> None:
     model = model_with({"inverse": InverseDynamics})
     assert model.auxiliary_coefs == {"inverse": 1.0, "samples": 1.0}
     heads = model.policy.auxiliary["inverse"]
-    before, deepmdp = clone_parameters(heads), clone_parameters(model.policy.auxiliary["deepmdp"])
+    assert list(model.policy.auxiliary) == ["inverse"]
+    before = clone_parameters(heads)
     losses = []
     for _ in range(2):
         model.train(100, batch_size=32)
         losses.append(model.logger.name_to_value["train/aux_inverse_loss"])
     assert losses[1] < 0.9 * losses[0]
     assert changed(before, heads) == {"net.weight", "net.bias"}
-    assert not changed(deepmdp, model.policy.auxiliary["deepmdp"])  # not asked for
     assert logged_terms(model) == {"train/aux_inverse_loss", "train/aux_samples_loss"}
     assert model.logger.name_to_value["train/aux_samples_loss"] == 32
 
@@ -124,21 +124,17 @@ def test_callback_schedules_the_coefficients() -> None:
     assert seen == sorted(seen, reverse=True) and len(set(seen)) > 30
 
 
-def test_callback_switches_the_losses_on_later(tmp_path: Path) -> None:
-    model = model_with(None)
-    before = clone_parameters(model.policy.auxiliary)
-    model.learn(20)
-    assert not changed(before, model.policy.auxiliary) and not logged_terms(model)
-    model.learn(20, callback=DeepMDPCallback())
-    assert changed(before, model.policy.auxiliary) == set(before)
-    assert model.auxiliary_coefs == {"transition": 1.0, "reward": 1.0}
-    # The callback itself is not saved; what it set is
-    model.save(tmp_path / "model")
-    loaded = HAVESAC.load(tmp_path / "model", device="cpu")
-    before = clone_parameters(loaded.policy.auxiliary)
-    fill_buffer(loaded, 20)
-    loaded.train(1, batch_size=8)
-    assert changed(before, loaded.policy.auxiliary) == set(before)
+def test_the_initial_actor_does_not_depend_on_the_auxiliary_losses() -> None:
+    with_heads, without = model_with("deepmdp"), model_with(None)
+    assert not without.policy.auxiliary
+    weights = with_heads.policy.state_dict()
+    for name, value in without.policy.state_dict().items():
+        assert th.equal(value, weights[name]), name
+
+
+def test_callback_needs_a_model_with_its_losses() -> None:
+    with pytest.raises(ValueError, match="it has none; build it with"):
+        model_with(None).learn(20, callback=DeepMDPCallback())
 
 
 def test_coefficient_of_zero_trains_nothing_but_logs() -> None:
@@ -177,7 +173,7 @@ def test_two_losses_of_one_name_are_refused() -> None:
         terms: ClassVar[tuple[str, ...]] = ("reward", "samples")
 
     with pytest.raises(ValueError, match="reward"):
-        model_with({"own": OwnReward})
+        model_with({"deepmdp": DeepMDP, "own": OwnReward})
 
 
 class OwnDeepMDP(DeepMDP):
@@ -206,7 +202,7 @@ def test_what_is_no_auxiliary_loss(auxiliary: Any) -> None:
         model_with(auxiliary)
 
 
-def test_a_schedule_begins_anew_with_every_run() -> None:
+def test_a_schedule_starts_again_with_every_run() -> None:
     model = tiny_model(vectors_space())
     callback = DeepMDPCallback(schedule=lambda progress_remaining: progress_remaining)
     model.learn(20, callback)

@@ -25,7 +25,7 @@ from sb3_have.configuration import (
 )
 from sb3_have.envs.drivers import RandomDriver
 from sb3_have.evaluation.evaluation import evaluate_episodes
-from sb3_have.have.deepmdp import DeepMDP
+from sb3_have.have.auxiliary import DeepMDP
 from sb3_have.train import Run
 
 #: Ends every episode after two steps.
@@ -81,7 +81,7 @@ def test_dotted_paths_become_classes() -> None:
     config = {
         "policy": "MultiInputPolicy",
         "replay_buffer_class": "sb3_have.ModalityReplayBuffer",
-        "auxiliary": {"mine": "sb3_have.have.deepmdp.DeepMDP"},
+        "auxiliary": {"mine": "sb3_have.have.auxiliary.DeepMDP"},
         "policy_kwargs": {
             "fusion": "transfuser",
             "activation_fn": "torch.nn.Tanh",

@@ -13,7 +13,7 @@ import torch as th
 
 from benchmarks import reliability, reliability_runs
 from benchmarks.reliability_report import report, values
-from benchmarks.reliability_runs import METHODS, VARIANTS, Drive, evaluate, make_model
+from benchmarks.reliability_runs import METHODS, Drive, evaluate, make_model
 from benchmarks.reliability_vec_env import ReliabilityDriveVecEnv
 from sb3_have import HAVESAC
 
@@ -44,17 +44,6 @@ def test_methods_differ_in_what_they_are_named_for_alone(method: str) -> None:
         assert getattr(model, name) == getattr(have, name)
     sizes = [sum(p.numel() for p in m.actor.parameters()) for m in (model, have)]
     assert sizes[0] == sizes[1]
-
-
-@pytest.mark.parametrize("method", VARIANTS)
-def test_variants_take_the_paper_s_target_or_say_why_not(method: str) -> None:
-    if method in ("have-flat", "have-residual", "have-min-before"):
-        with pytest.raises(ValueError, match=f'^{method}: target="paper" mixes.*train it with target="bellman"'):
-            make_model(method, 0, target="paper")
-    else:
-        model = make_model(method, 0, target="paper", learning_starts=16, batch_size=8)
-        assert model.learn(24).target == "paper" and model._n_updates > 0
-    assert make_model(method, 0).target == "bellman"
 
 
 def _setting(model: HAVESAC, name: str) -> Any:

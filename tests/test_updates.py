@@ -103,15 +103,6 @@ def test_the_actors_loss_leaves_no_gradient_in_the_values() -> None:
     assert all(p.grad is not None and p.grad.any() for p in model.actor.latent_pi.parameters())
 
 
-def test_without_auxiliary_losses_their_heads_rest() -> None:
-    model = ready_model(auxiliary=None)
-    before = clone_parameters(model.policy.auxiliary)
-    assert before
-    model.train(3, batch_size=32)
-    assert not changed(before, model.policy.auxiliary)
-    assert not any(name.startswith("train/aux") for name in model.logger.name_to_value)
-
-
 def test_auxiliary_losses_train_the_encoder() -> None:
     model = ready_model()
     model._critic_loss = lambda values, target_q: 0.0 * values.q.sum()  # type: ignore[method-assign]

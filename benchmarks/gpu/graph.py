@@ -146,20 +146,21 @@ class GraphedUpdate:
             graph, losses = self.graphs[due]
             graph.replay()  # type: ignore[no-untyped-call, unused-ignore]
             model._n_updates = update
-            model._last_losses |= losses
+            for name, loss in losses.items():
+                model.logger.record(name, loss)
         model.logger.record("train/learning_rate", rate)
         model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
 
     def _record(self) -> tuple[th.cuda.CUDAGraph, dict[str, th.Tensor]]:
         """The graph and the losses that it writes; recording computes nothing."""
         model = self.model
-        n_updates, before = model._n_updates, model._last_losses
-        model._last_losses = {}
+        n_updates = model._n_updates
         graph = th.cuda.CUDAGraph()
         with th.cuda.graph(graph, stream=self.stream):
             self._train()
-        losses = model._last_losses
-        model._n_updates, model._last_losses = n_updates, before
+        logged: dict[str, Any] = model.logger.name_to_value
+        losses = {name: value for name, value in logged.items() if isinstance(value, th.Tensor)}
+        model._n_updates = n_updates
         return graph, losses
 
     def _train(self) -> None:
@@ -188,7 +189,6 @@ def make_capturable(optimizer: th.optim.Optimizer) -> None:
 
 def losses_of(model: HAVESAC) -> dict[str, float]:
     """The losses of the last update."""
-    model._record_losses()
     names = (name for name in model.logger.name_to_value if name.endswith(("loss", "ent_coef")))
     return {name: float(model.logger.name_to_value[name]) for name in names}
 

@@ -31,7 +31,7 @@ from torch.nn.parameter import is_lazy
 
 from sb3_have.common import crossq, encoders, fusion
 from sb3_have.common.buffers import stacked_frames
-from sb3_have.have.deepmdp import DeepMDP
+from sb3_have.have.auxiliary import DeepMDP
 from sb3_have.have.have import HAVESAC
 from sb3_have.have.policies import MultiModalPolicy
 

@@ -1,12 +1,15 @@
-"""Auxiliary losses on the critic's features: the interface, and the callback that switches and schedules them."""
+"""Auxiliary losses on the critic's features (Eq. 12): the interface, DeepMDP, and a callback for their coefficients."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Container, Mapping
 from typing import Any, ClassVar, NamedTuple
 
 import torch as th
+import torch.nn.functional as F
 from stable_baselines3.common.callbacks import BaseCallback
 from torch import nn
+
+from sb3_have.common.networks import ParallelMLP
 
 
 class LatentTransitions(NamedTuple):
@@ -48,17 +51,51 @@ class AuxiliaryLoss(nn.Module, ABC):
         """One scalar loss for each of ``terms``, unweighted."""
 
 
+class DeepMDP(AuxiliaryLoss):
+    """
+    DeepMDP (Gelada et al. 2019, https://arxiv.org/abs/1906.02736), the auxiliary losses of HAVE (Eq. 12).
+
+    It predicts the next features of each modality from (z_i, a), those of all modalities from (z_g, a), and the reward
+    from (z_g, a). The next features come from the target encoder, without gradient; the LayerNorm of the encoders keeps
+    them from collapsing. Both losses are mean squared errors; ``transition`` is the mean of the global and the local
+    loss.
+
+    :param n_modalities: d
+    :param features_dim: F
+    :param action_dim: A
+    :param hidden_dim: width of the hidden layer of each head
+    """
+
+    terms: ClassVar[tuple[str, ...]] = ("transition", "reward")
+
+    def __init__(self, n_modalities: int, features_dim: int, action_dim: int, hidden_dim: int = 256):
+        super().__init__(n_modalities, features_dim, action_dim)
+        n_fused = n_modalities * features_dim
+        self.local_transition = ParallelMLP(n_modalities, features_dim + action_dim, features_dim, [hidden_dim])
+        self.global_transition = ParallelMLP(1, n_fused + action_dim, n_fused, [hidden_dim])
+        self.reward = ParallelMLP(1, n_fused + action_dim, 1, [hidden_dim])
+
+    def forward(self, batch: LatentTransitions) -> dict[str, th.Tensor]:
+        actions = batch.actions.unsqueeze(1).expand(-1, self.n_modalities, -1)
+        local_inputs = th.cat([batch.features, actions], dim=2).transpose(0, 1)  # (d, B, F + A)
+        global_inputs = th.cat([batch.features.flatten(start_dim=1), batch.actions], dim=1).unsqueeze(0)
+        local_loss = F.mse_loss(self.local_transition(local_inputs), batch.next_features.transpose(0, 1))
+        global_loss = F.mse_loss(self.global_transition(global_inputs)[0], batch.next_features.flatten(start_dim=1))
+        return {
+            "transition": 0.5 * (local_loss + global_loss),
+            "reward": F.mse_loss(self.reward(global_inputs)[0], batch.rewards),
+        }
+
+
 class AuxiliaryLossCallback(BaseCallback):
     """
     Callback for setting the coefficients of auxiliary losses, when training starts and at every step.
 
-    The heads are part of the policy, and this callback switches their losses on and off. With a coefficient of 0 a loss
-    has no gradient, but it is still computed and logged.
+    With a coefficient of 0 a loss has no gradient, but it is still computed and logged.
 
-    :param coefficients: coefficient of each term
-    :param schedule: factor on all of them as a function of the progress remaining (1 at the start, 0 at the end), as
-        SB3's schedules
-    :param verbose: as in SB3
+    :param coefficients: Coefficient of each term
+    :param schedule: Factor on all of them as a function of the progress remaining (from 1 to 0), as in SB3
+    :param verbose: Verbosity level
     """
 
     model: Any  # a HAVESAC, whose module imports this one
@@ -97,25 +134,41 @@ class AuxiliaryLossCallback(BaseCallback):
             self.model.auxiliary_coefs[term] = factor * coefficient
 
 
-def auxiliary_classes(
-    auxiliary: str | Mapping[str, type[AuxiliaryLoss]] | None, known: Mapping[str, type[AuxiliaryLoss]]
-) -> dict[str, type[AuxiliaryLoss]]:
+class DeepMDPCallback(AuxiliaryLossCallback):
     """
-    The losses that are switched on, by name.
+    Callback for setting the coefficients of the DeepMDP losses.
+
+    ``HAVESAC(auxiliary="deepmdp")``, the default, trains them with coefficient 1, so this callback is only needed for
+    other coefficients and for a schedule.
+
+    :param transition_coef: Coefficient of the next-features loss
+    :param reward_coef: Coefficient of the reward loss
+    :param schedule: Factor on both as a function of the progress remaining (from 1 to 0)
+    :param verbose: Verbosity level
+    """
+
+    def __init__(
+        self,
+        transition_coef: float = 1.0,
+        reward_coef: float = 1.0,
+        schedule: Callable[[float], float] | None = None,
+        verbose: int = 0,
+    ):
+        super().__init__({"transition": transition_coef, "reward": reward_coef}, schedule, verbose)
+
+
+def auxiliary_classes(auxiliary: str | Mapping[str, type[AuxiliaryLoss]] | None) -> dict[str, type[AuxiliaryLoss]]:
+    """
+    Return the classes of the auxiliary losses by name.
 
     :param auxiliary: HAVESAC's argument
-    :param known: the losses that a name alone stands for
-    :raises ValueError: if it is neither a known name, None, nor a mapping of names to classes
+    :raises ValueError: if it is neither "deepmdp", None, nor a mapping of names to classes
     """
     if auxiliary is None:
         return {}
-    if isinstance(auxiliary, str):
-        if auxiliary not in known:
-            raise ValueError(
-                f"auxiliary={auxiliary!r}: expected one of {list(known)}, None, or {{name: AuxiliaryLoss class}}."
-            )
-        return {auxiliary: known[auxiliary]}
-    classes = dict(auxiliary) if isinstance(auxiliary, Mapping) else {"": auxiliary}
+    if auxiliary == "deepmdp":
+        return {"deepmdp": DeepMDP}
+    classes: dict[str, Any] = dict(auxiliary) if isinstance(auxiliary, Mapping) else {"": auxiliary}
     for name, loss in classes.items():
         if not (name and isinstance(loss, type) and issubclass(loss, AuxiliaryLoss)):
             raise ValueError(f"auxiliary={auxiliary!r}: expected 'deepmdp', None, or {{name: AuxiliaryLoss class}}.")
@@ -124,12 +177,12 @@ def auxiliary_classes(
 
 def auxiliary_losses(modules: nn.ModuleDict, batch: LatentTransitions, terms: Container[str]) -> dict[str, th.Tensor]:
     """
-    Those of the ``terms`` that the auxiliary losses of a policy know.
+    Compute the auxiliary losses of a policy.
 
-    :param modules: the losses
-    :param batch: what they are computed of
-    :param terms: names of the wanted terms
-    :raises ValueError: if a loss does not return the terms that it announces
+    :param modules: the auxiliary losses
+    :param batch: transitions
+    :param terms: names of the terms to return; a module without any of them is not called
+    :raises ValueError: if a module does not return the terms that it announces
     """
     losses: dict[str, th.Tensor] = {}
     for module in modules.values():

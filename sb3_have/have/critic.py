@@ -8,7 +8,7 @@ Features z are (B, d, F); the global features z_g are their concatenation (B, d*
 
 import math
 from collections.abc import Sequence
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import torch as th
 import torch.nn.functional as F
@@ -119,17 +119,9 @@ class AssignmentNetwork(nn.Module):
         self.key = nn.Linear(features_dim, attention_dim, bias=False)
 
     def forward(self, features: th.Tensor) -> th.Tensor:
-        return F.softmax(self.scores(features), dim=1)  # Eq. 9
-
-    def scores(self, features: th.Tensor) -> th.Tensor:
-        """(W_q z_g) . (W_k z_i) / sqrt(p): features (B, d, F) to (B, d)."""
         query = self.query(features.flatten(start_dim=1)).unsqueeze(2)  # (B, p, 1)
-        scores: th.Tensor = (self.keys(features) @ query).squeeze(2)
-        return scores / math.sqrt(query.shape[1])
-
-    def keys(self, features: th.Tensor) -> th.Tensor:
-        """W_k z_i: features (B, d, F) to (B, d, p)."""
-        return self.key(features)  # type: ignore[no-any-return]
+        scores = (self.key(features) @ query).squeeze(2) / math.sqrt(query.shape[1])
+        return F.softmax(scores, dim=1)  # Eq. 9
 
 
 class RefusionNetwork(nn.Module):
@@ -201,8 +193,6 @@ class MultiModalCritic(BaseModel):
     :raises ValueError: for an unknown ``value_estimation`` or ``refusion``
     """
 
-    assignment_class: ClassVar[type[AssignmentNetwork]] = AssignmentNetwork
-
     def __init__(
         self,
         observation_space: spaces.Space[Any],
@@ -226,7 +216,7 @@ class MultiModalCritic(BaseModel):
         heads = (n_modalities, features_dim, get_action_dim(action_space), net_arch, activation_fn, n_critics)
         if value_estimation != "gve":
             self.local_critics = LocalCritics(*heads)
-            self.assignment = self.assignment_class(n_modalities, features_dim, attention_dim)
+            self.assignment = AssignmentNetwork(n_modalities, features_dim, attention_dim)
         if value_estimation != "lve":
             self.global_critic = GlobalCritic(*heads)
         if value_estimation == "have":
@@ -239,34 +229,16 @@ class MultiModalCritic(BaseModel):
         :param features: (B, d, F)
         :param actions: (B, A), scaled to [-1, 1]
         """
-        q_global = q_local = weights = None
-        if self.value_estimation != "gve":
-            q_local = self.local_critics(features, actions)
-            weights = self.assignment(features)
-        if self.value_estimation != "lve":
+        if self.value_estimation == "gve":
             q_global = self.global_critic(features, actions)
-        return self.mix(q_global, q_local, weights, features)
-
-    def mix(
-        self,
-        q_global: th.Tensor | None,
-        q_local: th.Tensor | None,
-        weights: th.Tensor | None,
-        features: th.Tensor,
-    ) -> Values:
-        """
-        Mix global and local values to the Q-value, for any number K of critics.
-
-        :param q_global: (K, B), None for "lve"
-        :param q_local: (K, d, B), None for "gve"
-        :param weights: (B, d), None for "gve"
-        :param features: (B, d, F)
-        """
-        if q_local is None or weights is None:
-            assert q_global is not None
             return Values(q_global, q_global, None, None, None)
+        q_local = self.local_critics(features, actions)
+        weights = self.weights(features)
         q_lve = (q_local * weights.t()).sum(dim=1)  # Eq. 6
-        q = q_lve if q_global is None else self.refusion(q_global, q_lve, features)  # section 3.4
+        if self.value_estimation == "lve":
+            return Values(q_lve, None, q_local, q_lve, weights)
+        q_global = self.global_critic(features, actions)
+        q = self.refusion(q_global, q_lve, features)  # section 3.4
         return Values(q, q_global, q_local, q_lve, weights)
 
     def min_q(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:

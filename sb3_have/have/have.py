@@ -1,29 +1,34 @@
 """HAVESAC: soft actor-critic with Hierarchical Adaptive Value Estimation."""
 
-from collections.abc import Mapping
+import io
+import pathlib
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import maybe_make_env
 from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 from stable_baselines3.common.utils import polyak_update
 
 from sb3_have.common.augmentation import check_random_shift, mean_over_copies, shifted_copies
+from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
 from sb3_have.have.auxiliary import AuxiliaryLoss, LatentTransitions, auxiliary_classes, auxiliary_losses
 from sb3_have.have.critic import MultiModalCritic, Values, drop_modalities
-from sb3_have.have.experience import SensorSAC, has_images
-from sb3_have.have.policies import MultiModalPolicy
+from sb3_have.have.policies import MultiModalPolicy, check_observation, check_stored_observation
 
 SelfHAVESAC = TypeVar("SelfHAVESAC", bound="HAVESAC")
 TARGETS = ("bellman", "paper")
 
 
-class HAVESAC(SensorSAC):
+class HAVESAC(SAC):
     """
     Hierarchical Adaptive Value Estimation on Soft Actor-Critic (HAVE-SAC)
 
@@ -75,10 +80,11 @@ class HAVESAC(SensorSAC):
         beginning of the rollout)
     :param use_sde_at_warmup: Whether to use gSDE instead of uniform sampling during the warm-up phase (before learning
         starts)
-    :param value_estimation: The Q-value used by the actor and the target: "have" (re-fusion of global and local
-        values), "lve" (weighted local values alone) or "gve" (global value alone), the ablations of the paper
-    :param refusion: The form of the re-fusion network: "convex", "monotone" or "free" (the paper's), see
-        :class:`~sb3_have.have.critic.RefusionNetwork`
+    :param value_estimation: Short for ``policy_kwargs=dict(value_estimation=...)``. The Q-value used by the actor and
+        the target: "have" (re-fusion of global and local values, the default), "lve" (weighted local values alone) or
+        "gve" (global value alone), the ablations of the paper
+    :param refusion: Short for ``policy_kwargs=dict(refusion=...)``. The form of the re-fusion network: "convex" (the
+        default), "monotone" or "free" (the paper's), see :class:`~sb3_have.have.critic.RefusionNetwork`
     :param target: "bellman" regresses on y = r + gamma (1 - done) (min_k H'_k - alpha log pi). "paper" is Eq. 10 as
         written, which mixes both sides of the Bellman equation: y = min_k H'_k(y_g, y_l) with
         y_j = r + gamma (1 - done) (q'_j - alpha log pi). The two are equal with "convex" re-fusion and without
@@ -93,14 +99,14 @@ class HAVESAC(SensorSAC):
     :param n_augmentations: The K and M of DrQ (2 there): the number of differently shifted copies of a sample. Target
         and critic loss are averaged over them; auxiliary losses and actor use the first.
     :param auxiliary: The auxiliary losses to train, with coefficient 1: "deepmdp", None, or
-        ``{name: AuxiliaryLoss class}`` (including "deepmdp" if wanted), see :class:`~sb3_have.DeepMDPCallback`
+        ``{name: AuxiliaryLoss class}`` (including "deepmdp" if wanted). :class:`~sb3_have.DeepMDPCallback` changes the
+        coefficients.
     :param compile: Whether to compile encoders, critics and auxiliary heads with ``torch.nn.Module.compile``. This
         takes minutes and is meant for CUDA, where it has not been tried yet.
     :param stats_window_size: Window size for the rollout logging, specifying the number of episodes to average the
         reported success rate, mean episode length, and mean reward over
     :param tensorboard_log: The log location for tensorboard (if None, no logging)
-    :param policy_kwargs: Additional arguments to be passed to the policy on creation, see :class:`MultiModalPolicy`;
-        ``value_estimation`` and ``refusion`` may be given here instead
+    :param policy_kwargs: Additional arguments to be passed to the policy on creation, see :class:`MultiModalPolicy`
     :param verbose: Verbosity level: 0 for no output, 1 for info messages (such as device or wrappers used), 2 for
         debug messages
     :param seed: Seed for the pseudo random generators
@@ -142,8 +148,8 @@ class HAVESAC(SensorSAC):
         use_sde: bool = False,
         sde_sample_freq: int = -1,
         use_sde_at_warmup: bool = False,
-        value_estimation: str = "have",
-        refusion: str = "convex",
+        value_estimation: str | None = None,
+        refusion: str | None = None,
         target: str = "bellman",
         local_coef: float = 1.0,
         modality_dropout: float = 0.0,
@@ -160,14 +166,14 @@ class HAVESAC(SensorSAC):
         _init_setup_model: bool = True,
     ):
         policy_kwargs = dict(policy_kwargs or {})
-        for name, value, default in [("value_estimation", value_estimation, "have"), ("refusion", refusion, "convex")]:
-            if policy_kwargs.setdefault(name, value) != value and value != default:
+        losses = auxiliary_classes(auxiliary)
+        for name, value in [
+            ("value_estimation", value_estimation),
+            ("refusion", refusion),
+            ("auxiliary_losses", losses),
+        ]:
+            if value is not None and policy_kwargs.setdefault(name, value) != value:
                 raise ValueError(f"{name}={value!r}, but policy_kwargs has {policy_kwargs[name]!r}: give it once.")
-        defaults = MultiModalPolicy.default_auxiliary_losses
-        losses = auxiliary_classes(auxiliary, defaults)
-        own_losses = {name: loss for name, loss in losses.items() if defaults.get(name) is not loss}
-        if own_losses:
-            policy_kwargs["auxiliary_losses"] = {**policy_kwargs.get("auxiliary_losses", {}), **own_losses}
         if env is not None:
             env = maybe_make_env(env, verbose)
             if not isinstance(env.action_space, spaces.Box):
@@ -213,12 +219,12 @@ class HAVESAC(SensorSAC):
         self.n_augmentations = n_augmentations
         self.auxiliary_coefs = {term: 1.0 for loss in losses.values() for term in loss.terms}
         self.compile = compile
-        self._last_losses: dict[str, th.Tensor] = {}
+        self.n_stack = 1
         if _init_setup_model:
             self._setup_model()
 
     def _setup_model(self) -> None:
-        # Here and not in the constructor, because `load` sets attributes in between
+        # Check here and not in the constructor, because `load` sets attributes in between
         if self.target not in TARGETS:
             raise ValueError(f"target={self.target!r}: expected one of {TARGETS}.")
         if not self.local_coef >= 0:
@@ -227,9 +233,21 @@ class HAVESAC(SensorSAC):
             raise ValueError(f"modality_dropout={self.modality_dropout}: expected a probability in [0, 1).")
         for name in ("policy_delay", "target_update_interval"):
             if not (isinstance(interval := getattr(self, name), int) and interval >= 1):
-                raise ValueError(f"{name}={interval!r}: expected a whole number of updates, from 1 on.")
+                raise ValueError(f"{name}={interval!r}: expected a whole number of updates, 1 or more.")
         check_random_shift(self.observation_space, self.random_shift, self.n_augmentations)
+
+        # Store images, and transitions for n-step returns, in a ModalityReplayBuffer
+        if self.env is not None:  # a model that is being loaded has its n_stack already
+            self.n_stack = stacked_frames(self.env)
+        if self.replay_buffer_class is None and (self.n_steps > 1 or has_images(self.observation_space)):
+            self.replay_buffer_class = ModalityReplayBuffer
+        given = self.n_steps, self.replay_buffer_kwargs
+        if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, ModalityReplayBuffer):
+            self.replay_buffer_kwargs = self._replay_buffer_kwargs()
+            self.n_steps = 1  # SB3 would warn that it is ignored
         super()._setup_model()
+        self.n_steps, self.replay_buffer_kwargs = given
+
         if self.compile:
             for module in (*self.critic.children(), *self.critic_target.children(), *self.policy.auxiliary.values()):
                 module.compile()
@@ -239,26 +257,30 @@ class HAVESAC(SensorSAC):
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         # Switch to train mode (this affects batch norm / dropout)
         self.policy.set_training_mode(True)
-
-        # Update learning rate according to lr schedule
+        # Update optimizers learning rate
         optimizers = [self.actor.optimizer, self.critic.optimizer]
         if self.ent_coef_optimizer is not None:
             optimizers += [self.ent_coef_optimizer]
+
+        # Update learning rate according to lr schedule
         self._update_learning_rate(optimizers)
 
         actor_parameters = [parameter for parameter in self.actor.parameters() if parameter.requires_grad]
         critic_parameters: list[th.Tensor] = list(self.critic.parameters())
         target_parameters: list[th.Tensor] = list(self.critic_target.parameters())
         assert isinstance(self.target_entropy, float)  # for the type checker
-        logs: dict[str, list[th.Tensor]] = {}
+
+        actor_losses, critic_losses = list[th.Tensor](), list[th.Tensor]()
+        ent_coefs, ent_coef_losses = list[th.Tensor](), list[th.Tensor]()
+        aux_losses: dict[str, list[th.Tensor]] = {}
 
         for _ in range(gradient_steps):
             self._n_updates += 1
 
             # Sample replay buffer
             replay_data = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)  # type: ignore[union-attr]
-            original = slice(len(replay_data.rewards))
-            if self.random_shift > 0:  # the shifted copies of the batch follow one another, the first is ``original``
+            # Augment the images (DrQ): the shifted copies of the batch follow one another
+            if self.random_shift > 0:
                 replay_data = shifted_copies(replay_data, self.random_shift, self.n_augmentations)
             # For n-step returns, the discount factor is gamma**n_steps (when no early termination)
             discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
@@ -268,69 +290,73 @@ class HAVESAC(SensorSAC):
             features = self.policy.encode(replay_data.observations)
             with th.no_grad():
                 next_features = self.critic_target.encoder(replay_data.next_observations)
-            inputs = drop_modalities(features, self.modality_dropout)
+            critic_features = drop_modalities(features, self.modality_dropout)
 
             # We need to sample because `log_std` may have changed between two gradient steps
             if self.use_sde:
                 self.actor.reset_noise()
+
+            # Important: detach the variable from the graph so we don't change it with other losses
             ent_coef = self.ent_coef_tensor if self.log_ent_coef is None else th.exp(self.log_ent_coef.detach())
+            ent_coefs.append(ent_coef)
 
             with th.no_grad():
                 # Select action according to policy
                 next_actions, next_log_prob = self.actor.action_log_prob(next_features.flatten(start_dim=1))
-                # Compute the target (Eq. 8, or Eq. 10): min over all critics, and entropy term
+                # Add the entropy term
                 entropy_bonus = -ent_coef * next_log_prob
+                # Compute the target Q-values (Eq. 8, or Eq. 10): min over all critics
                 rewards, not_done = replay_data.rewards.squeeze(1), 1 - replay_data.dones.squeeze(1)
                 discounts = (discounts.squeeze(1) if isinstance(discounts, th.Tensor) else discounts) * not_done
                 target_q = self._target_values(next_features, next_actions, rewards, discounts, entropy_bonus)
-                target_q = mean_over_copies(target_q, self.n_augmentations)
+                if self.n_augmentations > 1:
+                    target_q = mean_over_copies(target_q, self.n_augmentations)
 
             # Get the current Q-values (Eq. 6, Eq. 9, section 3.4), using actions from the replay buffer
-            values = self.critic.values(inputs, replay_data.actions)
+            values = self.critic.values(critic_features, replay_data.actions)
 
             # Compute critic loss
             critic_loss = self._critic_loss(values, target_q)
-            logs.setdefault("critic_loss", []).append(critic_loss.detach())
+            critic_losses.append(critic_loss.detach())
 
-            # Add the auxiliary losses (Eq. 12) on the same features
-            latent = (features, replay_data.actions, replay_data.rewards, next_features, replay_data.dones)
-            batch = LatentTransitions(*(tensor[original] for tensor in latent))
+            # Add the auxiliary losses (Eq. 12) on the same features, of the first copy of the batch
             loss = critic_loss
-            for term, aux_loss in auxiliary_losses(self.policy.auxiliary, batch, self.auxiliary_coefs).items():
+            latent = (features, replay_data.actions, replay_data.rewards, next_features, replay_data.dones)
+            transitions = LatentTransitions(*(tensor[:batch_size] for tensor in latent))
+            for term, aux_loss in auxiliary_losses(self.policy.auxiliary, transitions, self.auxiliary_coefs).items():
                 loss = loss + self.auxiliary_coefs[term] * aux_loss
-                logs.setdefault(f"aux_{term}_loss", []).append(aux_loss.detach())
+                aux_losses.setdefault(term, []).append(aux_loss.detach())
 
-            # Optimize critic, encoders and auxiliary heads
+            # Optimize the critic, with the encoders and the auxiliary heads
             self.critic.optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             self.critic.optimizer.step()
 
             if self._n_updates % self.policy_delay == 0:
-                # Action by the current actor for the sampled state, on detached features
-                actor_inputs = inputs[original].detach()
-                actions_pi, log_prob = self.actor.action_log_prob(actor_inputs.flatten(start_dim=1))
+                # Action by the current actor for the sampled state, from detached features
+                actor_features = critic_features[:batch_size].detach()
+                actions_pi, log_prob = self.actor.action_log_prob(actor_features.flatten(start_dim=1))
 
                 # Optimize entropy coefficient, also called entropy temperature or alpha in the paper
                 if self.ent_coef_optimizer is not None and self.log_ent_coef is not None:
                     ent_coef_loss = -(self.log_ent_coef * (log_prob + self.target_entropy).detach()).mean()
+                    ent_coef_losses.append(ent_coef_loss.detach())
                     self.ent_coef_optimizer.zero_grad()
                     ent_coef_loss.backward()  # type: ignore[no-untyped-call]
                     self.ent_coef_optimizer.step()
-                    logs.setdefault("ent_coef_loss", []).append(ent_coef_loss.detach())
 
                 # Compute actor loss (Eq. 11): min over all critics after mixing
-                min_q_pi = self.critic.min_q(actor_inputs, actions_pi)
+                min_q_pi = self.critic.min_q(actor_features, actions_pi)
                 actor_loss = (ent_coef * log_prob - min_q_pi).mean()
-                logs.setdefault("actor_loss", []).append(actor_loss.detach())
-                logs.setdefault("ent_coef", []).append(ent_coef)
+                actor_losses.append(actor_loss.detach())
 
-                # Optimize the actor; `actor_loss.backward()` would also compute gradients of the critic, for nothing
+                # Optimize the actor; `actor_loss.backward()` would also compute the gradients of the critic
                 gradients = th.autograd.grad(actor_loss, actor_parameters, allow_unused=True)
                 for parameter, gradient in zip(actor_parameters, gradients, strict=True):
                     parameter.grad = gradient
                 self.actor.optimizer.step()
 
-            # Update target networks: encoder, every critic, assignment and re-fusion
+            # Update target networks: encoder, all critics, assignment and re-fusion
             if self._n_updates % self.target_update_interval == 0:
                 with th.no_grad():
                     th._foreach_lerp_(target_parameters, critic_parameters, self.tau)
@@ -338,24 +364,25 @@ class HAVESAC(SensorSAC):
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self._last_losses |= {name: th.stack(tensors).mean() for name, tensors in logs.items()}
-        if self.device.type == "cpu":
-            self._record_losses()
+        self.logger.record("train/ent_coef", self._mean(ent_coefs))
+        self.logger.record("train/critic_loss", self._mean(critic_losses))
+        if actor_losses:
+            self.logger.record("train/actor_loss", self._mean(actor_losses))
+        if ent_coef_losses:
+            self.logger.record("train/ent_coef_loss", self._mean(ent_coef_losses))
+        for term, losses in aux_losses.items():
+            self.logger.record(f"train/aux_{term}_loss", self._mean(losses))
+
+    def _mean(self, losses: Sequence[th.Tensor]) -> float | th.Tensor:
+        """The mean; on a GPU it stays a tensor until :meth:`dump_logs`, because ``.item()`` synchronises the GPU."""
+        mean = th.stack(tuple(losses)).mean()
+        return mean.item() if self.device.type == "cpu" else mean
 
     def dump_logs(self) -> None:
-        self._record_losses()
+        for name, value in self.logger.name_to_value.items():
+            if isinstance(value, th.Tensor):
+                self.logger.name_to_value[name] = value.item()
         super().dump_logs()
-
-    def _record_losses(self) -> None:
-        """
-        Log the mean losses since the last call: train/critic_loss, train/actor_loss, train/ent_coef,
-        train/ent_coef_loss, train/aux_<term>_loss.
-
-        ``.item()`` makes the host wait for a GPU, so there the losses are only read when :meth:`dump_logs` is called.
-        """
-        for name, loss in self._last_losses.items():
-            self.logger.record(f"train/{name}", loss.item())
-        self._last_losses = {}
 
     def _target_values(
         self,
@@ -402,9 +429,6 @@ class HAVESAC(SensorSAC):
             loss = loss + self.local_coef * sum(squared_error(part) for part in parts if part is not None)
         return loss
 
-    def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_last_losses"]
-
     def modality_weights(self, observation: np.ndarray | dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """
         The attention weights of the modalities (Eq. 9), which sum to 1.
@@ -432,3 +456,64 @@ class HAVESAC(SensorSAC):
             reset_num_timesteps=reset_num_timesteps,
             progress_bar=progress_bar,
         )
+
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        tb_log_name: str = "run",
+        progress_bar: bool = False,
+    ) -> tuple[int, BaseCallback]:
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
+        assert self._last_obs is not None
+        check_observation(self._last_obs, self.observation_space)
+        if self._vec_normalize_env is not None:
+            assert self._last_original_obs is not None
+            check_stored_observation(self._last_original_obs, self.observation_space)
+        return result
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        """Refuse NaN before it reaches the replay buffer, from where it would silently spoil the networks."""
+        # After an episode's end, new_obs is the first observation of the next one
+        last_observations = [info["terminal_observation"] for info in infos if "terminal_observation" in info]
+        for observation in [new_obs, *last_observations]:
+            check_observation(observation, self.observation_space)
+        if not np.isfinite(reward).all():
+            raise ValueError(
+                f"reward: got {reward} at step {self.num_timesteps}, expected finite numbers; fix the environment's "
+                "reward function (SB3's VecCheckNan shows where it comes from)."
+            )
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+
+    def _replay_buffer_kwargs(self) -> dict[str, Any]:
+        """The user's keyword arguments for a ModalityReplayBuffer, and those that follow from the environment."""
+        return {"n_stack": self.n_stack, "n_steps": self.n_steps, "gamma": self.gamma, **self.replay_buffer_kwargs}
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        Load a replay buffer from a pickle file.
+
+        :param path: Path to the pickled replay buffer
+        :param truncate_last_traj: Whether the last trajectory ends where the buffer was saved. Use False if the
+            environment continues from there.
+        """
+        super().load_replay_buffer(path, truncate_last_traj)
+        if isinstance(self.replay_buffer, ModalityReplayBuffer):
+            kwargs = self._replay_buffer_kwargs()
+            self.replay_buffer.n_steps, self.replay_buffer.gamma = kwargs["n_steps"], kwargs["gamma"]
+            if truncate_last_traj:
+                self.replay_buffer.truncate_last_trajectory()
+
+
+def has_images(space: spaces.Space[Any]) -> bool:
+    """Whether an observation space, or one of its keys, is a uint8 image."""
+    return any(map(is_image_space, space.spaces.values() if isinstance(space, spaces.Dict) else [space]))

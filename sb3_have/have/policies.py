@@ -15,9 +15,8 @@ from torch import nn
 from torch.distributions import Normal
 
 from sb3_have.common.encoders import MultiModalEncoder
-from sb3_have.have.auxiliary import AuxiliaryLoss
+from sb3_have.have.auxiliary import AuxiliaryLoss, DeepMDP
 from sb3_have.have.critic import MultiModalCritic
-from sb3_have.have.deepmdp import DeepMDP
 
 SelfGaussian = TypeVar("SelfGaussian", bound="SquashedGaussian")
 
@@ -59,12 +58,11 @@ class MultiModalPolicy(SACPolicy):
     :param value_estimation: "have", "lve" or "gve", see :class:`~sb3_have.have.critic.MultiModalCritic`
     :param refusion: "convex", "monotone" or "free", see :class:`~sb3_have.have.critic.RefusionNetwork`
     :param attention_dim: Size of the queries and keys of the assignment network (p in Eq. 9)
-    :param auxiliary_losses: Auxiliary losses by name, in addition to DeepMDP's
+    :param auxiliary_losses: Auxiliary losses by name; none by default
     """
 
     critic: MultiModalCritic  # type: ignore[assignment]
     critic_target: MultiModalCritic  # type: ignore[assignment]
-    default_auxiliary_losses: ClassVar[dict[str, type[AuxiliaryLoss]]] = {"deepmdp": DeepMDP}
     critic_class: ClassVar[type[MultiModalCritic]] = MultiModalCritic
 
     def __init__(
@@ -136,15 +134,18 @@ class MultiModalPolicy(SACPolicy):
 
         encoder = self.critic.encoder
         sizes = (len(encoder.modalities), encoder.features_dim, get_action_dim(self.action_space))
-        losses = {**self.default_auxiliary_losses, **self.auxiliary_losses}
-        terms = [term for loss_class in losses.values() for term in loss_class.terms]
+        terms = [term for loss_class in self.auxiliary_losses.values() for term in loss_class.terms]
         doubled = {term for term in terms if terms.count(term) > 1}
         if doubled:
             raise ValueError(
-                f"auxiliary losses {list(losses)}: more than one has the terms {sorted(doubled)}; rename them, or take "
-                "DeepMDP's place by the name 'deepmdp'."
+                f"auxiliary losses {list(self.auxiliary_losses)}: more than one has the terms {sorted(doubled)}; "
+                "rename them."
             )
-        self.auxiliary = nn.ModuleDict({name: loss_class(*sizes) for name, loss_class in losses.items()})
+        # DeepMDP's heads are drawn first and even if they are not kept, so that the same seed gives the same initial
+        # actor with and without auxiliary losses
+        losses: dict[str, type[AuxiliaryLoss]] = {"deepmdp": DeepMDP, **self.auxiliary_losses}
+        heads = {name: loss_class(*sizes) for name, loss_class in losses.items()}
+        self.auxiliary = nn.ModuleDict({name: heads[name] for name in self.auxiliary_losses})
 
         self.actor = self.make_actor()
         self.actor.optimizer = self._make_optimizer(list(self.actor.parameters()), lr_schedule)
@@ -295,7 +296,7 @@ def _check_value(key: str, value: np.ndarray, space: spaces.Space[Any]) -> None:
     if not np.isfinite(value).all():
         raise ValueError(
             f"observation key {key!r}: {np.count_nonzero(~np.isfinite(value))} of {np.size(value)} values are NaN "
-            "or infinite; mend the environment (SB3's VecCheckNan shows where they come from)."
+            "or infinite; fix the environment (SB3's VecCheckNan shows where they come from)."
         )
 
 
