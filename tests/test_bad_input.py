@@ -59,7 +59,9 @@ def test_a_key_in_place_of_a_list_of_keys() -> None:
 
 
 def test_keys_that_do_not_fit_together() -> None:
-    refused(lambda: model_with_modalities({"all": ["rgb", "state"]}), "'all'", "'rgb'", "(4,)", "of their own")
+    refused(
+        lambda: model_with_modalities({"all": ["rgb", "state"]}), "'all'", "'rgb'", "(4,)", "each of them a modality"
+    )
     two_sizes = spaces.Dict({"near": image(3, 36), "far": image(3, 40)})
     refused(lambda: tiny_model(two_sizes, {"modalities": {"both": ["near", "far"]}}), "'both'", "36", "40")
 

@@ -178,7 +178,7 @@ def test_bad_arguments() -> None:
         ModalityWeightsCallback(episode_freq=10)
     env = RandomSensors(vectors_space())
     callback = ModalityWeightsCallback(eval_env=env, episode_freq=10)
-    with pytest.raises(ValueError, match="trained in"):
+    with pytest.raises(ValueError, match="training environment"):
         tiny_model(vectors_space(), env=env).learn(1, callback)
 
 

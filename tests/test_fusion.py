@@ -273,12 +273,12 @@ def test_encoder_with_fusion(name: str, stages: str) -> None:
         ({"fusion": "efnet", "fusion_kwargs": {"stages": [3]}}, "numbers 0 to 2"),
         ({"fusion": "efnet", "fusion_kwargs": {"stages": []}}, "numbers 0 to 2"),
         ({"fusion": "efnet", "fusion_kwargs": {"stages": "first"}}, "stages='first'"),
-        ({"fusion": "transfuser", "fusion_kwargs": {"n_heads": 5}}, "64 channels does not divide among 5 heads"),
-        ({"fusion": "efnet", "fusion_kwargs": {"n_heads": 5}}, "64 channels does not divide among 5 heads"),
+        ({"fusion": "transfuser", "fusion_kwargs": {"n_heads": 5}}, "64 channels cannot be divided among 5 heads"),
+        ({"fusion": "efnet", "fusion_kwargs": {"n_heads": 5}}, "64 channels cannot be divided among 5 heads"),
         ({"fusion": "efnet", "encoder_classes": {"rgb": NatureCNN}}, "modality 'rgb': CrossModalChannelAttention"),
         (
             {"fusion": "efnet", "encoder_kwargs": {"rgb": {"layers": [(4, 3, 2)]}}},
-            "equally many stages, got .*'rgb': 1",
+            "same number of stages, got .*'rgb': 1",
         ),
     ],
 )
@@ -311,7 +311,7 @@ class SubclassOfBrighter(Brighter):
 @pytest.mark.parametrize("encoder_class", [Brighter, SubclassOfBrighter])
 def test_encoder_whose_forward_would_be_bypassed(encoder_class: type[ImageEncoder]) -> None:
     encoder_classes = {"event": encoder_class}
-    with pytest.raises(ValueError, match=rf"modality 'event': {encoder_class.__name__} has a `forward` of its own"):
+    with pytest.raises(ValueError, match=rf"modality 'event': {encoder_class.__name__} overrides `forward`"):
         MultiModalEncoder(two_images(), 8, encoder_classes=encoder_classes, fusion="efnet")
     MultiModalEncoder(two_images(), 8, encoder_classes=encoder_classes)
 
@@ -338,7 +338,7 @@ def test_own_fusion_must_keep_the_shapes() -> None:
         def forward(self, maps: Sequence[th.Tensor]) -> list[th.Tensor]:
             return [values[:, ::2] for values in maps]
 
-    with pytest.raises(ValueError, match="Halving made maps of the shapes"):
+    with pytest.raises(ValueError, match="Halving returned maps of the shapes"):
         MultiModalEncoder(two_images(), 8, fusion=Halving)(sampled(two_images()))
 
 

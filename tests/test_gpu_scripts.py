@@ -95,7 +95,7 @@ class Waits(TorchDispatchMode):
         lambda x: x.masked_select(x > 0),
         lambda x: x.index_put_((x > 0,), th.zeros_like(x.sum())),
         lambda x: th.normal(x, x.abs()),
-        lambda x: Normal(x, x.abs()),
+        lambda x: Normal(x, x.abs(), validate_args=True),
         lambda x: x * th.tensor(2.0),
         lambda x: x.tolist(),
         lambda x: x.cpu(),

@@ -1,4 +1,4 @@
-"""Replay memory for stacked images: every frame is stored once."""
+"""Replay buffer for stacked images that stores every frame once."""
 
 import os
 from typing import Any
@@ -18,36 +18,38 @@ Observation = np.ndarray | dict[str, np.ndarray]
 
 class ModalityReplayBuffer(ReplayBuffer):
     """
-    SB3's ``DictReplayBuffer`` (and ``ReplayBuffer``) in a fraction of the memory, with n-step returns.
+    Replay buffer for Dict observations (or a Box) with n-step returns, which needs a fraction of the memory of SB3's
+    ``DictReplayBuffer`` and ``ReplayBuffer``.
 
-    A stack of k frames shares k - 1 of them with the next one, and ``next_obs`` is the following ``obs``; so each frame
-    is stored once, and a transition is 2 k slot numbers. A stack that does not continue the last one (reset,
-    truncation, a loaded buffer, a wrapper that changes it) is stored anew. Therefore samples are exactly what SB3's
-    buffers hold, whatever is added and whatever ``n_stack`` is; only the memory depends on it. All ``buffer_size``
-    transitions are always there. Indices are drawn as SB3 does, so the same seed gives the same batch.
+    A stack of k frames shares k - 1 of them with the next one, and ``next_obs`` is the following ``obs``, so this
+    buffer stores each frame once, and 2 k slot numbers for a transition. A stack that does not continue the last one
+    (after a reset, a truncation, loading the buffer, or a wrapper that changes it) is stored separately. Therefore
+    samples are exactly those of SB3's buffers, whatever is added and whatever ``n_stack`` is, which only changes the
+    memory used. The buffer always holds ``buffer_size`` transitions. Indices are drawn as in SB3, so the same seed
+    gives the same batch.
 
-    SB3 takes it too: ``SAC("MultiInputPolicy", env, replay_buffer_class=ModalityReplayBuffer,
+    It also works with SB3's algorithms: ``SAC("MultiInputPolicy", env, replay_buffer_class=ModalityReplayBuffer,
     replay_buffer_kwargs=dict(n_stack=stacked_frames(env)))``.
 
-    SB3's users have asked for both, for Dict observations, in its issues #37 and #1936 and its pull request #243.
+    SB3's issues #37 and #1936 and its pull request #243 ask for both features for Dict observations.
 
-    :param buffer_size: transitions, over all environments
+    :param buffer_size: Max number of transitions in the buffer, over all environments
     :param observation_space: Dict of Boxes or other array-valued spaces, or a Box; uint8 images (kC, H, W) are split
-        into k frames, every other key is stored whole, once a step
-    :param action_space: as in SB3
-    :param device: where samples go
-    :param n_envs: number of parallel environments
-    :param optimize_memory_usage: must be False, frames are stored once anyway
-    :param handle_timeout_termination: as in SB3: a truncated episode is not a termination
-    :param n_stack: k, the frames in a stacked image, see :func:`stacked_frames`; HAVESAC finds it
-    :param n_steps: length of n-step returns; they end with the episode, at the last transition written, and where the
-        observations do not continue
-    :param gamma: discount of n-step returns
-    :param storage: "memory", "mmap" (temporary files, for more than fits into memory) or "device" (frames on the
+        into k frames, and every other key is stored once per step
+    :param action_space: Action space
+    :param device: PyTorch device to which samples are moved
+    :param n_envs: Number of parallel environments
+    :param optimize_memory_usage: Must be False, because frames are stored once anyway
+    :param handle_timeout_termination: Handle timeout termination (due to time limit) separately, as in SB3
+    :param n_stack: Number of frames in a stacked image (k), see :func:`stacked_frames`; HAVESAC sets it
+    :param n_steps: Number of steps of n-step returns. They stop at the end of the episode, at the last transition
+        written, and where observations do not continue.
+    :param gamma: Discount factor of n-step returns
+    :param storage: "memory", "mmap" (temporary files, for more frames than fit into memory) or "device" (frames on the
         device, where CUDA gathers them without the host)
-    :param mmap_dir: directory for the files of "mmap"; by default the system's for temporary files
-    :raises ValueError: for bad arguments; the message names them and the remedy. Memory is reserved when the first
-        transition comes: then a lack of it raises MemoryError, a full disk OSError
+    :param mmap_dir: Directory for the files of "mmap"; by default the system's directory for temporary files
+    :raises ValueError: for invalid arguments. Memory is reserved when the first transition is added, which can raise
+        MemoryError, or OSError if the disk is full.
     """
 
     def __init__(
@@ -67,9 +69,11 @@ class ModalityReplayBuffer(ReplayBuffer):
     ):
         super(ReplayBuffer, self).__init__(buffer_size, observation_space, action_space, device, n_envs=n_envs)
         if optimize_memory_usage:
-            raise ValueError("optimize_memory_usage=True: leave it False, this buffer stores every frame once anyway.")
+            raise ValueError(
+                "optimize_memory_usage=True: leave it False, because this buffer stores every frame once anyway."
+            )
         if n_stack < 1 or n_steps < 1:
-            raise ValueError(f"n_stack={n_stack}, n_steps={n_steps}: expected whole numbers from 1 on.")
+            raise ValueError(f"n_stack={n_stack}, n_steps={n_steps}: expected whole numbers >= 1.")
         self.buffer_size = max(buffer_size // n_envs, 1)
         self.optimize_memory_usage = False
         self.handle_timeout_termination = handle_timeout_termination
@@ -110,14 +114,14 @@ class ModalityReplayBuffer(ReplayBuffer):
         infos: list[dict[str, Any]],
     ) -> None:
         """
-        Stores one transition of every environment.
+        Add one transition of every environment.
 
-        :param obs: stacked observations (n_envs, ...), one array for each key
-        :param next_obs: the same; of an episode that ends, its last observation and not the reset's
+        :param obs: Stacked observations (n_envs, ...), one array for each key
+        :param next_obs: The next observations; at the end of an episode its last observation, not that of the reset
         :param action: (n_envs, action_dim)
         :param reward: (n_envs,)
         :param done: (n_envs,), 1 where the episode ended
-        :param infos: with "TimeLimit.truncated" where it ended by time
+        :param infos: With "TimeLimit.truncated" where the time limit ended the episode
         """
         stacks, next_stacks = self._as_dict(obs), self._as_dict(next_obs)
         successor = (self.pos + 1) % self.buffer_size
@@ -129,7 +133,8 @@ class ModalityReplayBuffer(ReplayBuffer):
                 {key: value[env] for key, value in next_stacks.items()},
             )
             self.slots[self.pos, env] = slots, next_slots
-            # a slot that the next older transition does not use is used by none: stacks only move forward
+            # Free the slots of the overwritten transition that the next older one does not use: as stacks only move
+            # forward, no other one uses them
             self.pool.give_back(old - set(self.slots[successor, env].ravel().tolist()) - {EMPTY})
         self._last_next = {key: value.copy(order="K") for key, value in next_stacks.items()}
 
@@ -150,7 +155,7 @@ class ModalityReplayBuffer(ReplayBuffer):
     def _store(
         self, env: int, stack: dict[str, np.ndarray], next_stack: dict[str, np.ndarray]
     ) -> tuple[list[int], list[int]]:
-        """Slots of the two stacks of a transition; what is there already is not written again."""
+        """Store the two stacks of a transition, except frames that are stored already, and return their slots."""
         last = self._last_next
         self.continues[self.pos, env] = last is not None and all(
             np.array_equal(stack[key], last[key][env]) for key in stack
@@ -163,7 +168,7 @@ class ModalityReplayBuffer(ReplayBuffer):
         return slots, self._store_stack(next_stack)
 
     def _store_stack(self, stack: dict[str, np.ndarray]) -> list[int]:
-        """Stores every frame of a stack; padding, by zeros or by repetition, takes no slot of its own."""
+        """Store every frame of a stack; padding by zeros or by repetition takes no additional slot."""
         slots = [self._store_newest(stack)]
         frames = {key: self._split(key, stack[key]) for key in self.stacked_keys}
         for j in range(self.n_stack - 2, -1, -1):
@@ -177,14 +182,14 @@ class ModalityReplayBuffer(ReplayBuffer):
         return slots[::-1]
 
     def _store_newest(self, stack: dict[str, np.ndarray]) -> int:
-        """Stores the newest frame of the images, and all of the other keys."""
+        """Store the newest frame of the images and the values of all other keys."""
         slot = self.pool.take()
         frames = {key: self._split(key, stack[key])[-1] if key in self.stacked_keys else stack[key] for key in stack}
         self.pool.write(slot, frames)
         return slot
 
     def _split(self, key: str, stack: np.ndarray) -> np.ndarray:
-        """(kC, H, W) to (k, C, H, W)."""
+        """Split (kC, H, W) into (k, C, H, W)."""
         return stack.reshape(self.n_stack, *self.pool.shapes[key])
 
     def _get_samples(  # type: ignore[override]
@@ -216,11 +221,11 @@ class ModalityReplayBuffer(ReplayBuffer):
         )
 
     def _gather(self, slots: np.ndarray, env: VecNormalize | None) -> tuple[dict[str, th.Tensor], dict[str, th.Tensor]]:
-        """Observations and next observations, from their slots (2, batch, k)."""
+        """Return observations and next observations from their slots (2, batch, k)."""
         self.pool.to(self.device)
         pairs = {}
         for key, shape in self.shapes.items():
-            key_slots = slots if key in self.stacked_keys else slots[:, :, -1]  # a whole key is in the newest slot
+            key_slots = slots if key in self.stacked_keys else slots[:, :, -1]  # other keys are in the newest slot
             frames = self.pool.gather(key, key_slots.ravel(), pin_memory=self.device.type == "cuda")
             pairs[key] = frames.view(2, -1, *shape)
         obs, next_obs = ({key: pair[i] for key, pair in pairs.items()} for i in range(2))
@@ -232,7 +237,7 @@ class ModalityReplayBuffer(ReplayBuffer):
         )
 
     def _normalized(self, observations: dict[str, th.Tensor], env: VecNormalize) -> dict[str, th.Tensor]:
-        """The keys that VecNormalize normalises; it copies whatever it is given, so it is not given the others."""
+        """Return the keys that VecNormalize normalizes, without the others, because it copies whatever it is given."""
         if not isinstance(self.observation_space, spaces.Dict):
             array = self._normalize_obs(observations["observation"].cpu().numpy(), env)
             return {"observation": th.as_tensor(array)}
@@ -249,10 +254,12 @@ class ModalityReplayBuffer(ReplayBuffer):
         self, batch_inds: np.ndarray, env_indices: np.ndarray, env: VecNormalize | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
-        :param batch_inds: (batch,) the first transitions
-        :param env_indices: (batch,) their environments
-        :param env: for the normalisation of rewards
-        :return: index of each last transition, the discounted returns and the discounts gamma^m, (batch,) each
+        Compute n-step returns.
+
+        :param batch_inds: Index of each first transition (batch,)
+        :param env_indices: Its environment (batch,)
+        :param env: The VecNormalize that normalizes rewards
+        :return: Index of each last transition, discounted returns and discounts gamma^m, each (batch,)
         """
         indices = (batch_inds[:, None] + np.arange(self.n_steps)) % self.buffer_size  # (batch, n)
         envs = env_indices[:, None]
@@ -267,7 +274,7 @@ class ModalityReplayBuffer(ReplayBuffer):
         return last_inds, returns, self.gamma ** n_rewards.astype(np.float32)
 
     def truncate_last_trajectory(self) -> None:
-        """Lets no n-step return run from what is stored into what is added next, as after loading the buffer."""
+        """Make n-step returns stop at the last stored transition, as needed after loading the buffer."""
         self._last_next = None
 
     def reset(self) -> None:
@@ -278,12 +285,12 @@ class ModalityReplayBuffer(ReplayBuffer):
 
     @property
     def nbytes(self) -> int:
-        """Bytes that are really taken: of as many frames as were ever in use at once, and of the tables."""
+        """Bytes in use: the largest number of frames that were stored at once, and the tables."""
         tables = (self.slots, self.continues, self.actions, self.rewards, self.dones, self.timeouts)
         return self.pool.nbytes + sum(table.nbytes for table in tables)
 
 
 def stacked_frames(env: VecEnv) -> int:
-    """The number of frames that ``VecFrameStack`` stacks somewhere in a chain of wrappers, 1 without it."""
+    """Return the number of frames that ``VecFrameStack`` stacks somewhere in a chain of wrappers, or 1 without it."""
     wrapper = unwrap_vec_wrapper(env, VecFrameStack)
     return 1 if wrapper is None else wrapper.stacked_obs.n_stack

@@ -14,7 +14,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 
 class MultiInputPolicy(CrossQPolicy):
-    """CrossQ's policy with a features extractor for Dict observations by default; the parameters are CrossQPolicy's."""
+    """CrossQPolicy with a features extractor for Dict observations by default; its parameters are the same."""
 
     def __init__(self, *args: Any, **kwargs: Any):
         kwargs.setdefault("features_extractor_class", CombinedExtractor)
@@ -23,11 +23,11 @@ class MultiInputPolicy(CrossQPolicy):
 
 class MultiInputCrossQ(CrossQ):
     """
-    CrossQ (Bhatt et al. 2024) that also knows ``"MultiInputPolicy"``; the algorithm is sb3-contrib's, untouched.
+    CrossQ (Bhatt et al. 2024) with a ``"MultiInputPolicy"``; the algorithm is sb3-contrib's, unchanged.
 
-    Its training step joins observations and next observations by ``torch.cat``, as the joint batch statistics ask for;
-    here they come as dictionaries that ``torch.cat`` joins key by key. The features extractor is SB3's
-    ``CombinedExtractor`` by default; with the encoders of HAVESAC it is::
+    For the joint batch statistics, its training step concatenates observations and next observations by ``torch.cat``.
+    Here they are dictionaries that ``torch.cat`` concatenates key by key. The default features extractor is SB3's
+    ``CombinedExtractor``. To use the encoders of HAVESAC::
 
         MultiInputCrossQ("MultiInputPolicy", env,
                          policy_kwargs=dict(features_extractor_class=MultiModalExtractor, normalize_images=False))
@@ -49,7 +49,7 @@ class MultiInputCrossQ(CrossQ):
 
 
 class _Joinable:
-    """Samples of a replay buffer, their dictionaries as :class:`_JoinableDict`."""
+    """A replay buffer whose samples hold a :class:`_JoinableDict` instead of each dictionary."""
 
     def __init__(self, replay_buffer: ReplayBuffer):
         self.replay_buffer = replay_buffer
@@ -65,7 +65,7 @@ class _Joinable:
 
 
 class _JoinableDict(dict[str, th.Tensor]):
-    """Tensors by name that ``torch.cat`` joins key by key."""
+    """A dictionary of tensors that ``torch.cat`` concatenates key by key."""
 
     @classmethod
     def __torch_function__(

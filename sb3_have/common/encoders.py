@@ -1,36 +1,115 @@
-"""From a Dict of raw observations to one feature vector per modality."""
+"""Encoders: from a Dict of raw observations to one feature vector for each modality."""
 
 from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import torch as th
 import torch.nn.functional as F
 from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_have.common.fusion import encode_fused, make_fusions
-from sb3_have.common.modalities import Modality, check_known, make_modality
 
-EVENT_SCALE = 1 / 8  # one event is 0.125, about the contrast of a clearly visible edge in an image scaled to [0, 1]
+# One event is 0.125, about the contrast of a clearly visible edge in an image scaled to [0, 1]
+EVENT_SCALE = 1 / 8
 PRECISIONS = ("auto", "float32", "bfloat16")
-PAPER_ENCODER_MIN_SIZE = 112  # px; from here on an image gets the paper's encoder, below a Nature-style one
+# Images of at least this many pixels get the paper's encoder by default, smaller ones that of the Nature DQN
+PAPER_ENCODER_MIN_SIZE = 112
+
+
+class Modality(NamedTuple):
+    """A group of observation keys that share an encoder."""
+
+    keys: tuple[str, ...]
+    space: spaces.Box
+    is_image: bool
+
+
+def make_modality(name: str, keys: Sequence[str], space: spaces.Dict, normalize_images: bool) -> Modality:
+    """
+    Check that an encoder can read these observations, and return their joint space.
+
+    :param name: Name of the modality
+    :param keys: Its observation keys
+    :param space: Observation space
+    :param normalize_images: Whether images have to be uint8
+    :raises ValueError: if an observation cannot be encoded, or they cannot be encoded together
+    """
+    if isinstance(keys, str) or not keys:
+        raise ValueError(f"modality {name!r}: expected a non-empty list of observation keys, got {keys!r}.")
+    check_known(f"modality {name!r}", keys, space.spaces)
+    boxes = [_check_box(key, space[key], normalize_images) for key in keys]
+    is_image = [len(box.shape) == 3 for box in boxes]
+    if len(keys) == 1:
+        return Modality(tuple(keys), boxes[0], is_image[0])
+    shapes = {key: box.shape for key, box in zip(keys, boxes, strict=True)}
+    if all(is_image) and len({shape[1:] for shape in shapes.values()}) == 1:
+        shape = (sum(box.shape[0] for box in boxes), *boxes[0].shape[1:])
+        dtypes = {box.dtype for box in boxes}
+        if dtypes == {np.dtype(np.uint8)}:
+            return Modality(tuple(keys), spaces.Box(0, 255, shape, np.uint8), True)
+        return Modality(tuple(keys), spaces.Box(-np.inf, np.inf, shape, np.float32), True)
+    if not any(is_image):
+        size = sum(int(np.prod(box.shape)) for box in boxes)
+        return Modality(tuple(keys), spaces.Box(-np.inf, np.inf, (size,), np.float32), False)
+    raise ValueError(
+        f"modality {name!r}: its keys must be images of one height and width, or all vectors, got {shapes}; "
+        "make each of them a modality."
+    )
+
+
+def _check_box(key: str, space: spaces.Space[Any], normalize_images: bool) -> spaces.Box:
+    where = f"observation key {key!r}"
+    if not isinstance(space, spaces.Box):
+        raise ValueError(
+            f"{where}: expected a Box (an image or a vector), got {space}; encode it as numbers, e.g. "
+            "by a wrapper that flattens or one-hot encodes this key (gymnasium.spaces.utils.flatten)."
+        )
+    if len(space.shape) == 2 and space.dtype == np.uint8:
+        raise ValueError(
+            f"{where}: expected an image (H, W, C) or a vector, got {space.dtype} of shape {space.shape}; give a grey "
+            "image a channel axis (gymnasium.wrappers.ReshapeObservation, or image[..., None])."
+        )
+    if len(space.shape) != 3:
+        return space
+    if normalize_images and not is_image_space(space):
+        raise ValueError(
+            f"{where}: expected a uint8 image with bounds 0..255, got {space.dtype} of shape {space.shape} in "
+            f"[{space.low.min()}, {space.high.max()}]; convert it to uint8 (under "
+            "VecNormalize, leave it out of `norm_obs_keys`), or pass "
+            "`policy_kwargs=dict(normalize_images=False)` to feed channel-first images as they are."
+        )
+    if not is_image_space_channels_first(space):
+        raise ValueError(
+            f"{where}: expected a channel-first image (C, H, W), got shape {space.shape}; SB3 transposes uint8 images "
+            "with bounds 0..255 by itself, others have to be transposed by the environment."
+        )
+    return space
+
+
+def check_known(where: str, names: Sequence[str] | Mapping[str, Any], known: Sequence[str] | Mapping[str, Any]) -> None:
+    """Raise a ValueError about ``where`` if some of the ``names`` are not ``known``."""
+    unknown = [name for name in names if name not in known]
+    if unknown:
+        raise ValueError(f"{where}: unknown {', '.join(map(repr, unknown))}; known are {', '.join(map(repr, known))}.")
 
 
 class ImageEncoder(nn.Module):
     """
-    Convolutions, a linear layer and a LayerNorm: (batch, channels, height, width) float to (batch, features_dim).
+    Convolutions, a linear layer and a LayerNorm: float (batch, channels, height, width) to (batch, features_dim).
 
     :param observation_space: Box of shape (channels, height, width)
-    :param features_dim: size of the features
-    :param layers: (filters, kernel size, stride) of each convolution; None chooses by the image's size: the
-        four 3x3 layers of the paper (as in SAC-AE, Yarats et al. 2021) from 112 pixels on, the three layers of the
-        Nature DQN (Mnih et al. 2015) from 36 on, three 3x3 layers below.
+    :param features_dim: Number of features
+    :param layers: Filters, kernel size and stride of each convolution. By default they depend on the size of the image:
+        the four 3x3 layers of the paper (as in SAC-AE, Yarats et al. 2021) from 112 pixels up, the three layers of the
+        Nature DQN (Mnih et al. 2015) from 36 pixels up, and three 3x3 layers below that.
     """
 
     def __init__(
@@ -51,7 +130,7 @@ class ImageEncoder(nn.Module):
         self.convolutions = nn.Sequential(*modules)
         _, kernel_size, stride = layers[0] if layers else (0, 1, 1)
         fits = kernel_size > stride and kernel_size % stride == height % stride == width % stride == 0
-        # Side of the blocks of pixels in which :class:`BlockConv2d` reads the images fastest; 1 where it is pixels.
+        # Side of the blocks of pixels that :class:`BlockConv2d` reads fastest; 1 means single pixels
         self.block_size = stride if fits and stride in (2, 4, 8) and has_avx512() else 1
         with th.no_grad():
             n_flatten = self.convolutions(th.zeros(1, *observation_space.shape)).numel()
@@ -63,21 +142,21 @@ class ImageEncoder(nn.Module):
 
     @property
     def stages(self) -> list[nn.Module]:
-        """Each convolution with its ReLU, for a fusion to come between them."""
+        """Each convolution with its ReLU. A fusion acts between them."""
         return [self.convolutions[i : i + 2] for i in range(0, len(self.convolutions), 2)]
 
     def features(self, maps: th.Tensor) -> th.Tensor:
-        """(batch, features_dim) of the maps after the last stage."""
+        """Features (batch, features_dim) from the maps after the last stage."""
         features: th.Tensor = self.output(maps.permute(0, 2, 3, 1).flatten(start_dim=1))  # a view, not a copy
         return features
 
 
 class BlockConv2d(nn.Conv2d):
     """
-    A convolution that also reads images in blocks of stride x stride pixels (space to depth), see :func:`_look_up`.
+    A convolution that also accepts images in blocks of stride x stride pixels (space to depth), see :func:`_look_up`.
 
-    The sums are the same: 8x8 with stride 4 on pixels is 2x2 with stride 1 on blocks of 4x4. The latter takes less time
-    on a CPU with AVX-512 and more without it, because of the backward pass (``benchmarks.block_conv``).
+    The sums are the same: 8x8 with stride 4 on pixels is 2x2 with stride 1 on blocks of 4x4. The latter is faster on a
+    CPU with AVX-512 and slower without it, because of the backward pass (``benchmarks.block_conv``).
     """
 
     def forward(self, images: th.Tensor) -> th.Tensor:
@@ -90,7 +169,7 @@ class BlockConv2d(nn.Conv2d):
 
 
 def default_layers(size: int) -> list[tuple[int, int, int]]:
-    """(filters, kernel size, stride) of the convolutions for an image whose shorter side is ``size`` pixels."""
+    """Filters, kernel size and stride of each convolution, for an image whose shorter side is ``size`` pixels."""
     if size >= PAPER_ENCODER_MIN_SIZE:
         return [(32, 3, 2), (32, 3, 1), (32, 3, 1), (32, 3, 1)]
     if size >= 36:
@@ -105,11 +184,11 @@ def default_layers(size: int) -> list[tuple[int, int, int]]:
 
 class VectorEncoder(nn.Module):
     """
-    A multi-layer perceptron and a LayerNorm: (batch, n) float to (batch, features_dim).
+    A multi-layer perceptron and a LayerNorm: float (batch, n) to (batch, features_dim).
 
     :param observation_space: Box of shape (n,)
-    :param features_dim: size of the features
-    :param net_arch: widths of the hidden layers
+    :param features_dim: Number of features
+    :param net_arch: Widths of the hidden layers
     """
 
     def __init__(self, observation_space: spaces.Box, features_dim: int = 50, net_arch: Sequence[int] = (64,)):
@@ -127,27 +206,28 @@ class MultiModalEncoder(nn.Module):
     """
     One encoder per modality: z_i = Enc_i(o_i), stacked to (batch, d, features_dim).
 
-    Raw observations are decoded here, by fixed scales and never by statistics of the batch, so that acting and
-    training see the same numbers: uint8 images are divided by 255; images of signed counts (128 = none, as the event
-    camera's) become ``(value - 128) / 8`` with 0 standing for "no data", which decodes to 0 like "no event" (frame
-    stacking pads with zeros at reset); vectors and, with ``normalize_images=False``, all images are taken as they are.
+    The encoder decodes raw observations by fixed scales and never by statistics of the batch, so that acting and
+    training see the same numbers. uint8 images are divided by 255. Images of signed counts (128 means none, as for an
+    event camera) become ``(value - 128) / 8``; 0 means "no data" and decodes to 0 like "no event", because frame
+    stacking pads with zeros at reset. Vectors are taken as they are, and all images with ``normalize_images=False``.
 
-    :param observation_space: Dict of Boxes (images channel-first), or one Box, a single modality named ``observation``
-    :param features_dim: F, the size of each modality's features
-    :param modalities: keys of each modality, e.g. ``{"vision": ["rgb", "depth"], "event": ["event"]}``; the keys of a
-        modality are all images of one size or all vectors. By default every key is a modality of its own.
-    :param encoder_classes: an own encoder for some modalities, called as ``cls(space, features_dim=F, **kwargs)``;
-        SB3's features extractors fit
-    :param encoder_kwargs: keyword arguments for the encoder of some modalities
-    :param signed_keys: image keys holding signed counts around 128; by default those with "event" in their name
-    :param normalize_images: whether to decode images as above
-    :param precision: of the image encoders' arithmetic: "float32", "bfloat16" (features and weights stay float32), or
-        "auto", bfloat16 where the hardware multiplies it natively (CPU with AMX, CUDA from sm80 on)
-    :param fusion: what mixes the modalities' feature maps: "concat", nothing (features are concatenated later on),
-        "transfuser", "efnet", or an own class, see :mod:`sb3_have.common.fusion`; the modalities must all be images
-    :param fusion_kwargs: ``stages`` ("last" by default, "all", or numbers from 0 on), the convolutions it comes after,
-        each time with parameters of its own; the others are its keyword arguments
-    :raises ValueError: for a space, key or modality that cannot be encoded; the message names it and the remedy
+    :param observation_space: Dict of Boxes (channel-first images), or one Box, a single modality named ``observation``
+    :param features_dim: Number of features of each modality (F)
+    :param modalities: The observation keys of each modality, such as
+        ``{"vision": ["rgb", "depth"], "event": ["event"]}``. The keys of a modality are all images of one size or all
+        vectors. By default every key is a modality.
+    :param encoder_classes: Custom encoder classes for some modalities, called as
+        ``cls(space, features_dim=F, **kwargs)``; SB3's features extractors fit
+    :param encoder_kwargs: Keyword arguments for the encoders of some modalities
+    :param signed_keys: Image keys that hold signed counts around 128; by default those with "event" in their name
+    :param normalize_images: Whether to decode uint8 images as described above
+    :param precision: Arithmetic of the image encoders: "float32", "bfloat16" (weights and features stay float32), or
+        "auto", which uses bfloat16 where the hardware multiplies it natively (a CPU with AMX, CUDA from sm80 on)
+    :param fusion: Fusion of the modalities' feature maps: "concat" (none: the features are concatenated later),
+        "transfuser", "efnet", or a custom class, see :mod:`sb3_have.common.fusion`. All modalities must be images.
+    :param fusion_kwargs: Keyword arguments for the fusion, and ``stages``, the convolutions after which it is applied,
+        each time with its own parameters: "last" (default), "all", or their numbers starting at 0
+    :raises ValueError: for a space, key or modality that cannot be encoded
     """
 
     def __init__(
@@ -230,12 +310,12 @@ class MultiModalEncoder(nn.Module):
         return th.stack([features.float() for features in encoded], dim=1)
 
     def image_dtype(self, device: th.device) -> th.dtype:
-        """The arithmetic of the image encoders on ``device``."""
+        """The data type in which the image encoders compute on ``device``."""
         bfloat16 = self.precision == "bfloat16" or (self.precision == "auto" and has_native_bfloat16(device.type))
         return th.bfloat16 if bfloat16 else th.float32
 
     def _inputs(self, encoder: nn.Module, modality: Modality, observations: dict[str, th.Tensor]) -> th.Tensor:
-        """What a modality's encoder reads."""
+        """Decode the observations of a modality for its encoder."""
         dtype = self.image_dtype(observations[modality.keys[0]].device) if modality.is_image else th.float32
         # Subclasses may expect pixels, and the channels of several images cannot be joined in blocks
         block_size = encoder.block_size if type(encoder) is ImageEncoder and len(modality.keys) == 1 else 1
@@ -248,11 +328,12 @@ class MultiModalEncoder(nn.Module):
         if not is_image:
             return observation.to(dtype).flatten(start_dim=1)
         signed = key in self.signed_keys
-        # the table is NumPy's, which no graph can hold
+        # A traced graph cannot contain the look-up table, which is a NumPy array
         traced = th.compiler.is_compiling() or th.jit.is_tracing()  # type: ignore[attr-defined, no-untyped-call]
         if self.normalize_images and observation.dtype == th.uint8 and observation.device.type == "cpu" and not traced:
             return _look_up(observation, signed, dtype, block_size)
-        observation = observation.contiguous(memory_format=th.channels_last)  # before it has more bytes
+        # Transpose before the conversion to a wider data type, when there are fewer bytes to move
+        observation = observation.contiguous(memory_format=th.channels_last)
         return (decode_bytes(observation, signed) if self.normalize_images else observation).to(dtype)
 
 
@@ -263,20 +344,20 @@ class MultiModalExtractor(BaseFeaturesExtractor):
         TQC("MultiInputPolicy", env,
             policy_kwargs=dict(features_extractor_class=MultiModalExtractor, normalize_images=False))
 
-    ``normalize_images=False`` keeps SB3 from dividing all images by 255; the encoder decodes them, signed counts by a
-    scale of their own.
+    With ``normalize_images=False`` SB3 does not divide images by 255; the encoder decodes them, and signed counts have
+    another scale.
 
-    :param observation_space: as :class:`MultiModalEncoder` takes it
-    :param features_dim: F, the size of each modality's features; the property ``features_dim`` of SB3 is d * F
-    :param encoder_kwargs: further arguments of :class:`MultiModalEncoder`
-    :raises ValueError: as :class:`MultiModalEncoder` does, and in ``forward`` for images that SB3 has scaled already
+    :param observation_space: Observation space, see :class:`MultiModalEncoder`
+    :param features_dim: Number of features of each modality (F); SB3's attribute ``features_dim`` is d * F
+    :param encoder_kwargs: Additional arguments for :class:`MultiModalEncoder`
+    :raises ValueError: see :class:`MultiModalEncoder`; also in ``forward``, if SB3 has already scaled the images
     """
 
     def __init__(self, observation_space: spaces.Space[Any], features_dim: int = 50, **encoder_kwargs: Any):
         encoder = MultiModalEncoder(observation_space, features_dim, **encoder_kwargs)
         super().__init__(observation_space, len(encoder.modalities) * features_dim)
         self.encoder = encoder
-        # SB3 gives floats; these are made bytes again, which takes half the time to decode
+        # SB3 passes floats; convert them back to bytes, which are twice as fast to decode
         self.byte_keys = [
             key
             for modality in encoder.modalities.values()
@@ -286,7 +367,7 @@ class MultiModalExtractor(BaseFeaturesExtractor):
         self._has_seen_bytes = False
 
     def forward(self, observations: PyTorchObs) -> th.Tensor:
-        """Features (B, d*F) of observations whose images hold 0..255, of any type."""
+        """Return features (B, d*F) of observations whose images hold 0..255, in any data type."""
         raw = dict(observations) if isinstance(observations, dict) else {"observation": observations}
         for key in self.byte_keys:
             self._check_scale(key, raw[key])
@@ -303,11 +384,11 @@ class MultiModalExtractor(BaseFeaturesExtractor):
                 f"{images[images != images.round()][0]:.3g}; keep SB3 from scaling it, by "
                 "`policy_kwargs=dict(features_extractor_class=MultiModalExtractor, normalize_images=False)`."
             )
-        self._has_seen_bytes = bool((images > 1).any())  # what SB3 has scaled never is
+        self._has_seen_bytes = bool((images > 1).any())  # never true of images that SB3 has scaled
 
 
 def decode_bytes(values: th.Tensor, signed: bool) -> th.Tensor:
-    """What the bytes of an image stand for, in float32, see :class:`MultiModalEncoder`."""
+    """Decode the bytes of an image to float32, see :class:`MultiModalEncoder`."""
     if signed:
         return F.threshold(values.to(th.float32) - 128, -127.5, 0.0) * EVENT_SCALE  # 0 is "no data"
     return values.to(th.float32) / 255
@@ -315,26 +396,25 @@ def decode_bytes(values: th.Tensor, signed: bool) -> th.Tensor:
 
 def _look_up(images: th.Tensor, signed: bool, dtype: th.dtype, block_size: int = 1) -> th.Tensor:
     """
-    :func:`decode_bytes` of uint8 images in the CPU's memory by a table, which is faster than arithmetic.
+    Apply :func:`decode_bytes` to uint8 images on a CPU by a look-up table, which is faster than arithmetic.
 
     :param images: (B, C, H, W)
-    :param signed: whether the bytes are signed counts
+    :param signed: Whether the bytes are signed counts
     :param dtype: float32 or bfloat16
-    :param block_size: side n of the blocks in which the images are laid out for :class:`BlockConv2d`: 2, 4 or 8; 1 for
-        none
-    :return: (B, n*n*C, H/n, W/n) in channels-last memory, the channels in the order row in block, channel, column in
+    :param block_size: Side n of the blocks of pixels for :class:`BlockConv2d`: 2, 4 or 8, or 1 for no blocks
+    :return: (B, n*n*C, H/n, W/n) in channels-last memory; channels are ordered by row in block, channel, column in
         block
     """
     batch, channels, height, width = images.shape
     table = _table(signed, dtype)
     if block_size > 1 and batch > 0:
-        # The pixels of a row of a block are moved as one integer
+        # Move the pixels in a row of a block as one integer
         rows = images.contiguous().numpy().view(f"u{block_size}")
         rows = rows.reshape(batch, channels, height // block_size, block_size, width // block_size)
         blocks = np.ascontiguousarray(rows.transpose(0, 2, 4, 3, 1)).view(np.uint8)
         decoded = th.from_numpy(cv2.LUT(blocks.reshape(1, -1), table)).view(dtype)
         return decoded.view(batch, height // block_size, width // block_size, -1).permute(0, 3, 1, 2)
-    # Image by image, so that the bytes stay in the processor's cache between the transposition and the table
+    # Go image by image, so that the bytes stay in the processor's cache between transposition and look-up
     values = np.empty((batch, 1, height * width * channels), table.dtype)
     transposed = np.empty((height * width, channels), np.uint8)
     for image, decoded in zip(images.contiguous().numpy(), values, strict=True):
@@ -345,18 +425,18 @@ def _look_up(images: th.Tensor, signed: bool, dtype: th.dtype, block_size: int =
 
 @cache
 def _table(signed: bool, dtype: th.dtype) -> np.ndarray:
-    """The 256 values of :func:`decode_bytes`; OpenCV knows no bfloat16, so that one is given as its bits."""
+    """The 256 values of :func:`decode_bytes`. OpenCV has no bfloat16, so its bits are returned as integers."""
     table = decode_bytes(th.arange(256, device="cpu"), signed).to(dtype)
     return (table.view(th.int16) if dtype == th.bfloat16 else table).numpy()
 
 
 def _autocast(inputs: th.Tensor) -> th.autocast:
-    """Arithmetic of the type of ``inputs``."""
+    """Compute in the data type of ``inputs``."""
     return th.autocast(inputs.device.type, dtype=inputs.dtype, enabled=inputs.dtype != th.float32)
 
 
 def has_avx512() -> bool:
-    """Whether the CPU computes with AVX-512."""
+    """Whether the CPU has AVX-512."""
     return th.backends.cpu.get_cpu_capability() == "AVX512"
 
 
@@ -367,6 +447,6 @@ def has_native_bfloat16(device_type: str) -> bool:
     return device_type == "cpu" and th.cpu._is_amx_tile_supported()
 
 
-# The compiler cannot look at the hardware. This is what `th.compiler.assume_constant_result` does, which would import
-# the compiler, in as much time as all of PyTorch.
+# The compiler cannot query the hardware. `th.compiler.assume_constant_result` would do the same, but importing the
+# compiler takes as long as importing the rest of PyTorch.
 has_native_bfloat16._dynamo_marked_constant = True  # type: ignore[attr-defined]

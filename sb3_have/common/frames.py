@@ -1,4 +1,4 @@
-"""A pool of frames: the memory behind the replay buffer."""
+"""A pool of frames, the memory of the replay buffer."""
 
 import os
 import tempfile
@@ -22,18 +22,18 @@ EMPTY = 0  # the slot whose frame is all zeros, as the padding of frame stacking
 
 class FramePool:
     """
-    Slots that each hold one frame of every observation key, handed out and taken back one by one.
+    Slots that each hold one frame of every observation key.
 
-    A freed slot is the first to be used again, so what is written is what was in use at once, whatever the capacity.
-    The first slot taken reserves a block for all of the ``capacity``; a pool that needs more gets further blocks, so
-    that nothing is ever moved.
+    Freed slots are reused first, so memory is only written for the largest number of frames in use at once. The first
+    slot taken reserves a block for the whole ``capacity``; a pool that needs more gets additional blocks, so frames are
+    never moved.
 
-    :param capacity: slots of the first block
-    :param shapes: shape of a frame, for each key
+    :param capacity: Number of slots of the first block
+    :param shapes: Shape of a frame for each key
     :param dtypes: NumPy dtype of each key
     :param storage: "memory", "mmap" (unnamed temporary files, for more frames than fit into memory) or "device"
-    :param device: where "device" keeps its frames
-    :param mmap_dir: directory for the files of "mmap"; by default the system's, which may itself be in memory
+    :param device: PyTorch device of the frames with "device"
+    :param mmap_dir: Directory for the files of "mmap"; by default the system's, which may itself be in memory
     :raises ValueError: for an unknown storage, or a directory without "mmap"
     """
 
@@ -61,11 +61,11 @@ class FramePool:
 
     def take(self) -> int:
         """
-        A free slot, which is the caller's until it is given back.
+        Return a free slot, which belongs to the caller until it is given back.
 
         :raises ValueError: if ``mmap_dir`` does not exist
-        :raises MemoryError: if there is no room for another block
-        :raises OSError: if the disk has none
+        :raises MemoryError: if there is not enough memory for another block
+        :raises OSError: if there is not enough space on the disk
         """
         if self._free:
             return self._free.pop()
@@ -79,24 +79,24 @@ class FramePool:
         return self._n_written - 1
 
     def give_back(self, slots: Iterable[int]) -> None:
-        """Frees these slots."""
+        """Free these slots."""
         self._free.extend(slots)
 
     def write(self, slot: int, frames: Mapping[str, np.ndarray]) -> None:
-        """Stores a frame of some keys, as arrays of any layout."""
+        """Store a frame of some keys, from arrays of any memory layout."""
         number = bisect_right(self._starts, slot) - 1
         for key, frame in frames.items():
             array = np.array(frame, self.dtypes[key], order="C")
             self._blocks[number][key][slot - self._starts[number]] = th.from_numpy(array)
 
     def gather(self, key: str, slots: np.ndarray, pin_memory: bool = False) -> th.Tensor:
-        """Copies of the frames of ``key`` in these slots, (n,) to (n, *shape); in pinned memory where asked for."""
+        """Return copies of the frames of ``key`` in these slots (n,), as (n, *shape)."""
         out = self._empty(key, len(slots), pin_memory)
         if len(self._blocks) == 1:
             return th.index_select(self._blocks[0][key], 0, self._index(slots), out=out)
         numbers = np.searchsorted(self._starts, slots, side="right") - 1
         offsets = slots - np.array(self._starts)[numbers]
-        if self.device.type == "cpu":  # PyTorch's indexed writes take six times as long
+        if self.device.type == "cpu":  # PyTorch's indexed assignment takes six times as long
             frames, rows = [block[key].numpy() for block in self._blocks], out.numpy()
             for row, (number, offset) in enumerate(zip(numbers.tolist(), offsets.tolist(), strict=True)):
                 rows[row] = frames[number][offset]
@@ -108,23 +108,23 @@ class FramePool:
 
     def _index(self, slots: np.ndarray) -> th.Tensor:
         index = th.from_numpy(slots)
-        # pinned, a GPU's copy does not make the host wait
+        # Copy from pinned memory, so that the host does not wait for the GPU
         return index.pin_memory().to(self.device, non_blocking=True) if self.device.type == "cuda" else index
 
     def to(self, device: th.device) -> None:
-        """Moves the frames of "device" storage; the others stay where they are."""
+        """Move the frames to another device if the storage is "device"."""
         if self.storage == "device" and device != self.device:
             self.device = device
             self._blocks = [{key: frames.to(device) for key, frames in block.items()} for block in self._blocks]
 
     @property
     def n_used(self) -> int:
-        """Slots in use, :data:`EMPTY` among them."""
+        """Number of slots in use, including :data:`EMPTY`."""
         return self._n_written - len(self._free)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of as many frames as were ever in use at once: what the pool really takes."""
+        """Bytes of the largest number of frames that were in use at once."""
         return self._n_written * self._frame_bytes
 
     @property
@@ -134,7 +134,8 @@ class FramePool:
     def _reserve(self, n_frames: int) -> None:
         if self.storage == "memory" and psutil is not None:
             needed, available = n_frames * self._frame_bytes, psutil.virtual_memory().available
-            if needed > available:  # memory is taken as frames come in, so it would run out in mid-training
+            # The system only allocates memory as frames are written, so it would run out during training
+            if needed > available:
                 warnings.warn(
                     f"The replay buffer's frames will take {needed / 1e9:.1f} GB, but only {available / 1e9:.1f} GB of "
                     'memory are available: lower `buffer_size`, or use `replay_buffer_kwargs=dict(storage="mmap")`.',
@@ -154,36 +155,38 @@ class FramePool:
         self._n_reserved += n_frames
 
     def _empty(self, key: str, n_frames: int, pin_memory: bool = False) -> th.Tensor:
-        """Room for frames; not pinned, the host's takes no memory before they are written."""
+        """Allocate memory for frames; the system provides the host's memory, unless pinned, as it is written."""
         shape = (n_frames, *self.shapes[key])
         if self.device.type == "cpu" and not pin_memory:
-            return th.from_numpy(np.empty(shape, self.dtypes[key]))  # in huge pages, which PyTorch's are not
+            return th.from_numpy(np.empty(shape, self.dtypes[key]))  # NumPy uses huge pages, PyTorch does not
         dtype = th.from_numpy(np.empty(0, self.dtypes[key])).dtype
         return th.empty(shape, dtype=dtype, device=self.device, pin_memory=pin_memory and self.device.type == "cpu")
 
     def _map(self, key: str, n_frames: int) -> th.Tensor:
-        """Room for frames in a file without a name, taken at once, which the system removes with the process."""
+        """Allocate an unnamed file for frames, which the system removes with the process."""
         if self.mmap_dir is not None and not os.path.isdir(self.mmap_dir):
-            raise ValueError(f"mmap_dir={os.fspath(self.mmap_dir)!r}: no such directory; make it, or name another one.")
+            raise ValueError(
+                f"mmap_dir={os.fspath(self.mmap_dir)!r}: no such directory; create it, or use another one."
+            )
         shape = (n_frames, *self.shapes[key])
         n_bytes = int(np.prod(shape)) * self.dtypes[key].itemsize
         with tempfile.TemporaryFile(dir=self.mmap_dir) as file:
             try:
                 if hasattr(os, "posix_fallocate"):
-                    os.posix_fallocate(file.fileno(), 0, n_bytes)  # a full disk is an error now and not a crash later
+                    os.posix_fallocate(file.fileno(), 0, n_bytes)  # raises now if the disk is full
                 else:
                     file.truncate(n_bytes)
             except OSError as error:
                 raise OSError(
                     error.errno,
-                    f"{error.strerror}: no room for {n_bytes / 1e9:.1f} GB of frames of {key!r} in "
-                    f"{os.fspath(self.mmap_dir or tempfile.gettempdir())!r}; lower `buffer_size`, or name another "
+                    f"{error.strerror}: no space for {n_bytes / 1e9:.1f} GB of frames of {key!r} in "
+                    f"{os.fspath(self.mmap_dir or tempfile.gettempdir())!r}; lower `buffer_size`, or use another "
                     "`mmap_dir`",
                 ) from error
             return th.from_numpy(np.memmap(file, self.dtypes[key], "r+", shape=shape))
 
     def __getstate__(self) -> dict[str, Any]:
-        """What has been written, and no more."""
+        """Pickle only the slots that have been written."""
         state = self.__dict__.copy()
         starts = [start for start in self._starts if start < self._n_written]
         state["_blocks"] = [
@@ -205,7 +208,7 @@ class FramePool:
         ]
 
     def _stored(self, key: str, frames: np.ndarray) -> th.Tensor:
-        """Loaded frames where they belong; those in memory stay where they were loaded, without a copy."""
+        """Put loaded frames into the storage, without a copy if that is memory."""
         if self.storage != "mmap":
             return th.from_numpy(frames).to(self.device)
         mapped = self._map(key, len(frames))

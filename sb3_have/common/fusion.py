@@ -1,12 +1,12 @@
 """
-Fusion of feature maps: image encoders that look at each other between their convolutions.
+Fusion of feature maps: image encoders exchange information between their convolutions.
 
-Shapes: B batch, d modalities, and of modality i a map of C_i channels, H_i rows, W_i columns. A fusion comes after a
-stage (a convolution and its ReLU) of all encoders; each encoder then goes on with its own fused map, so that there are
-still d features, and everything that is done with features of modalities can be done with these.
+Shapes: B batch, d modalities; the map of modality i has C_i channels, H_i rows and W_i columns. A fusion follows a
+stage (a convolution and its ReLU) of all encoders. Each encoder then continues with its own fused map, so there is
+still one feature vector per modality, as without a fusion.
 
-What a fusion adds to the maps is zero at first, so that learning begins as without it. By PyTorch's usual
-initialisation it would be 4 to 60 times as large as the maps after the last convolution, and hide them.
+Fusions are initialised so that they add zero to the maps, and learning starts as without them. With PyTorch's default
+initialisation the added values are 4 to 60 times as large as the maps after the last convolution.
 """
 
 import math
@@ -22,10 +22,10 @@ Shape = tuple[int, int, int]
 
 class FeatureFusion(nn.Module):
     """
-    Base of the fusions, and the interface of an own one: it is given the shapes and implements ``forward``, from the
-    maps of all modalities after a stage to maps of the same shapes.
+    Base class of fusions. A subclass implements ``forward``, from the maps of all modalities after a stage to maps of
+    the same shapes.
 
-    :param shapes: (C_i, H_i, W_i) of each modality's map
+    :param shapes: Shape (C_i, H_i, W_i) of each modality's map
     """
 
     def __init__(self, shapes: Sequence[Shape]):
@@ -33,7 +33,7 @@ class FeatureFusion(nn.Module):
         self.shapes = list(shapes)
 
     def forward(self, maps: Sequence[th.Tensor]) -> list[th.Tensor]:
-        """Fused maps of the maps (B, C_i, H_i, W_i); under autocast, so they may be bfloat16."""
+        """Fuse the maps (B, C_i, H_i, W_i). This is called under autocast, so they may be bfloat16."""
         raise NotImplementedError
 
 
@@ -41,19 +41,19 @@ class Transfuser(FeatureFusion):
     """
     Transformer over the maps of all modalities, as in TransFuser (Prakash et al. 2021).
 
-    Each map is averaged to at most 8x8 areas, whose channels are tokens. The tokens of all modalities, with a learned
-    embedding of modality and place, pass through the transformer; what it makes of them is enlarged to the map's size,
-    bilinearly, and added to the map. Maps smaller than 8x8 give a token per pixel. Maps with fewer channels than the
-    widest are projected to its width and back.
+    Each map is pooled to at most 8x8 areas, and the channels of an area are a token. A learned embedding of modality
+    and position is added to the tokens of all modalities, and the transformer processes them together. Its output is
+    resized bilinearly to each map's size and added to the map. Maps smaller than 8x8 give one token per pixel. Maps
+    with fewer channels than the widest one are projected to its width and back.
 
-    102,144 parameters for HighwayVision-v0 with two modalities of 64 pixels and the default encoders.
+    It has 102,144 parameters for HighwayVision-v0 with two modalities of 64 pixels and the default encoders.
 
-    :param shapes: (C_i, H_i, W_i) of each modality's map
-    :param n_layers: number of attention and MLP blocks
-    :param n_heads: number of attention heads
-    :param mlp_ratio: hidden units of the MLPs, in widths of a token
-    :param grid_size: rows and columns of areas a map is averaged to, at most
-    :raises ValueError: if the channels do not divide among the heads
+    :param shapes: Shape (C_i, H_i, W_i) of each modality's map
+    :param n_layers: Number of attention and MLP blocks
+    :param n_heads: Number of attention heads
+    :param mlp_ratio: Width of the MLPs' hidden layer, in multiples of a token's width
+    :param grid_size: Maximum number of rows and columns of areas
+    :raises ValueError: if the channels cannot be divided among the heads
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class Transfuser(FeatureFusion):
         self.positions = nn.Parameter(th.randn(sum(self.sizes), width) * 0.02)
         self.layers = nn.ModuleList(TransformerLayer(width, n_heads, mlp_ratio) for _ in range(n_layers))
         self.norm = nn.LayerNorm(width)
-        nn.init.zeros_(self.norm.weight)  # nothing is added at first
+        nn.init.zeros_(self.norm.weight)  # add zero at first
         self.outputs = nn.ModuleList(
             nn.Linear(width, shape[0], bias=False) if needed else nn.Identity()  # the norm has a bias
             for shape, needed in zip(shapes, projected, strict=True)
@@ -97,11 +97,14 @@ class Transfuser(FeatureFusion):
 
 class TransformerLayer(nn.Module):
     """
-    Self-attention and an MLP, each behind a LayerNorm and added to what came in: tokens (B, T, width) to the same.
+    Self-attention and an MLP, each after a LayerNorm and with a skip connection; from tokens (B, T, width) to the same.
 
-    :param width: size of a token
-    :param n_heads: number of attention heads
-    :param mlp_ratio: hidden units of the MLP, in widths
+    ``nn.TransformerEncoderLayer(norm_first=True)`` computes the same, but its fused attention has a slow backward pass
+    in bfloat16 on a CPU.
+
+    :param width: Size of a token
+    :param n_heads: Number of attention heads
+    :param mlp_ratio: Width of the MLP's hidden layer, in multiples of ``width``
     """
 
     def __init__(self, width: int, n_heads: int, mlp_ratio: int):
@@ -119,10 +122,10 @@ class TransformerLayer(nn.Module):
 
 class SelfAttention(nn.Module):
     """
-    Scaled dot-product attention between tokens (Vaswani et al. 2017): (B, T, width) to the same.
+    Scaled dot-product attention between tokens (Vaswani et al. 2017), from (B, T, width) to the same.
 
-    :param width: size of a token
-    :param n_heads: number of heads
+    :param width: Size of a token
+    :param n_heads: Number of heads
     """
 
     def __init__(self, width: int, n_heads: int):
@@ -133,7 +136,7 @@ class SelfAttention(nn.Module):
 
     def forward(self, x: th.Tensor) -> th.Tensor:
         query, key, value = self.qkv(x).unflatten(2, (3, self.n_heads, -1)).permute(2, 0, 3, 1, 4)
-        # (B, heads, T, size) each; PyTorch's fused attention has a slow backward pass in bfloat16 on the CPU
+        # Each of them is (B, heads, T, size)
         scores = query @ key.transpose(2, 3) / math.sqrt(query.shape[3])
         weights = F.softmax(scores, dim=3, dtype=th.promote_types(scores.dtype, th.float32))
         attended = weights.to(value.dtype) @ value
@@ -143,19 +146,20 @@ class SelfAttention(nn.Module):
 
 class CrossModalChannelAttention(FeatureFusion):
     """
-    Attention of each modality's channels to those of the other modalities: the EICA block of EFNet (Sun et al. 2022).
+    Attention from each modality's channels to those of the other modalities: the EICA block of EFNet (Sun et al. 2022).
 
-    The query is the modality's own, keys and values are the others'; a channel is compared with another by its values
-    over all pixels, scaled to length one, times a temperature that is learned for each head. Result, and then an MLP at
-    each pixel, are added to the map. With three modalities and more a channel attends to the channels of all others at
-    once; a single modality attends to itself. Keys and values of maps of another size are resized, bilinearly.
+    The queries come from the modality itself, the keys and values from the others. Two channels are compared by the
+    cosine similarity of their values over all pixels, times a learned temperature for each head. The result is added to
+    the map, followed by an MLP at each pixel with a skip connection. With three or more modalities a channel attends to
+    the channels of all others at once; a single modality attends to itself. Keys and values of maps of another size are
+    resized bilinearly.
 
-    66,952 parameters for HighwayVision-v0 with two modalities of 64 pixels and the default encoders.
+    It has 66,952 parameters for HighwayVision-v0 with two modalities of 64 pixels and the default encoders.
 
-    :param shapes: (C_i, H_i, W_i) of each modality's map
-    :param n_heads: number of heads, among which the channels of each modality are divided
-    :param mlp_ratio: hidden units of the MLPs, in channels of the map
-    :raises ValueError: if the channels do not divide among the heads
+    :param shapes: Shape (C_i, H_i, W_i) of each modality's map
+    :param n_heads: Number of heads, among which the channels of each modality are divided
+    :param mlp_ratio: Width of the MLPs' hidden layer, in multiples of the map's channels
+    :raises ValueError: if the channels cannot be divided among the heads
     """
 
     def __init__(self, shapes: Sequence[Shape], n_heads: int = 4, mlp_ratio: int = 2):
@@ -186,7 +190,7 @@ class CrossModalChannelAttention(FeatureFusion):
 
 
 class _ChannelAttention(nn.Module):
-    """One modality's part; its linear layers act on the channels of each pixel, which makes them 1x1 convolutions."""
+    """The part of one modality. Its linear layers act on the channels of each pixel, as 1x1 convolutions do."""
 
     def __init__(self, channels: int, n_heads: int, mlp_ratio: int):
         super().__init__()
@@ -201,11 +205,17 @@ class _ChannelAttention(nn.Module):
             nn.Linear(channels, mlp_ratio * channels), nn.GELU(), nn.Linear(mlp_ratio * channels, channels)
         )
         for parameter in (*self.projection.parameters(), *self.mlp[2].parameters()):
-            nn.init.zeros_(parameter)  # nothing is added at first
+            nn.init.zeros_(parameter)  # add zero at first
 
     def forward(self, image: th.Tensor, query: th.Tensor, key: th.Tensor, value: th.Tensor) -> th.Tensor:
-        """Of a map and what :meth:`CrossModalChannelAttention._by_head` gives, keys and values of the others."""
-        precise = th.promote_types(query.dtype, th.float32)  # sums over all pixels, and the softmax
+        """
+        :param image: Map (B, C, H, W)
+        :param query: From the map itself, as :meth:`CrossModalChannelAttention._by_head` returns it
+        :param key: From the maps of the other modalities
+        :param value: From the maps of the other modalities
+        """
+        # Compute sums over all pixels and the softmax at least in float32
+        precise = th.promote_types(query.dtype, th.float32)
         query, key = F.normalize(query.to(precise), dim=3), F.normalize(key.to(precise), dim=3)
         scores = (query @ key.transpose(2, 3)).to(precise) * self.temperature.view(-1, 1, 1)
         attended = F.softmax(scores, dim=3).to(value.dtype) @ value
@@ -225,16 +235,17 @@ def make_fusions(
     **kwargs: Any,
 ) -> nn.ModuleDict:
     """
-    A fusion for each of the chosen stages, by the stage's number.
+    Create a fusion for each of the chosen stages.
 
-    :param fusion: name in :data:`FUSIONS`, or a module class that is called as ``cls(shapes, **kwargs)``
-    :param encoders: of each modality, with the attribute ``stages``, modules that are called one after the other, and
-        the method ``features``, from the last maps to the features, as :class:`~sb3_have.common.encoders.ImageEncoder`
-    :param shapes: (C, H, W) of each modality's images, or the shape of its vectors
-    :param stages: after which stages: "last", "all", or their numbers from 0 on
-    :param kwargs: of the fusion
-    :raises ValueError: if there is no such fusion or stage, or an encoder that has no stages or replaces ``forward``
-        alone, which is not called here; names it and the remedy
+    :param fusion: Name in :data:`FUSIONS`, or a module class, which is called as ``cls(shapes, **kwargs)``
+    :param encoders: Encoder of each modality. As in :class:`~sb3_have.common.encoders.ImageEncoder`, ``stages`` is a
+        list of modules to call one after the other, and ``features`` computes the features from the last maps.
+    :param shapes: Shape (C, H, W) of each modality's images, or the shape of its vectors
+    :param stages: Stages after which to fuse: "last", "all", or their numbers starting at 0
+    :param kwargs: Keyword arguments for the fusion
+    :return: The fusions by number of the stage
+    :raises ValueError: if there is no such fusion or stage, or if an encoder has no stages or overrides only
+        ``forward``, which would not be called
     """
     if isinstance(fusion, str):
         if fusion not in FUSIONS:
@@ -243,20 +254,20 @@ def make_fusions(
     for name, encoder in encoders.items():
         if len(shapes[name]) != 3 or not (hasattr(encoder, "stages") and hasattr(encoder, "features")):
             raise ValueError(
-                f"modality {name!r}: {fusion.__name__} fuses the maps of images, and there are none between the stages "
-                f"of {type(encoder).__name__} on observations of shape {shapes[name]}; leave the modality out by "
-                '`modalities`, use ImageEncoder or one with `stages` and `features` like it, or take fusion="concat".'
+                f"modality {name!r}: {fusion.__name__} fuses feature maps of images, but {type(encoder).__name__} has "
+                f"none for observations of shape {shapes[name]}; leave the modality out by `modalities`, use an "
+                'encoder with `stages` and `features` such as ImageEncoder, or use fusion="concat".'
             )
         if _replaces_forward_alone(type(encoder)):
             raise ValueError(
-                f"modality {name!r}: {type(encoder).__name__} has a `forward` of its own, which {fusion.__name__} "
-                "would not call: it calls the encoder's `stages` one after the other, and then `features`. Override "
-                'one of these instead, or take fusion="concat".'
+                f"modality {name!r}: {type(encoder).__name__} overrides `forward`, which {fusion.__name__} does not "
+                "call: it calls the encoder's `stages` one after the other and then `features`. Override one of these "
+                'instead, or use fusion="concat".'
             )
     numbers = {name: len(encoder.stages) for name, encoder in encoders.items()}  # type: ignore[arg-type]
     if len(set(numbers.values())) != 1:
         raise ValueError(
-            f"{fusion.__name__} needs encoders with equally many stages, got {numbers}; give them equally many layers "
+            f"{fusion.__name__} needs encoders with the same number of stages, got {numbers}; set their layers "
             "by `encoder_kwargs={<modality>: dict(layers=[(filters, kernel_size, stride), ...])}`."
         )
     n_stages = next(iter(numbers.values()))
@@ -275,8 +286,12 @@ def make_fusions(
 
 def encode_fused(encoders: Sequence[nn.Module], fusions: nn.ModuleDict, images: Sequence[th.Tensor]) -> list[th.Tensor]:
     """
-    Features (B, F) of each modality's images (B, C, H, W): the encoders stage by stage, and the fusions between them.
+    Run the encoders stage by stage, with the fusions between the stages.
 
+    :param encoders: Encoder of each modality
+    :param fusions: The fusions by number of the stage
+    :param images: Images (B, C, H, W) of each modality
+    :return: Features (B, F) of each modality
     :raises ValueError: if a fusion changes the shapes of the maps
     """
     maps = [image.contiguous(memory_format=th.channels_last) for image in images]
@@ -287,16 +302,16 @@ def encode_fused(encoders: Sequence[nn.Module], fusions: nn.ModuleDict, images: 
             maps = fusions[str(number)](maps)
             if [tuple(image.shape) for image in maps] != shapes:
                 raise ValueError(
-                    f"{type(fusions[str(number)]).__name__} made maps of the shapes "
-                    f"{[tuple(image.shape) for image in maps]} of {shapes}; let it keep them."
+                    f"{type(fusions[str(number)]).__name__} returned maps of the shapes "
+                    f"{[tuple(image.shape) for image in maps]}, expected {shapes}; a fusion must keep them."
                 )
     return [encoder.features(image) for encoder, image in zip(encoders, maps, strict=True)]  # type: ignore[operator]
 
 
 def _replaces_forward_alone(encoder_class: type[nn.Module]) -> bool:
-    """Whether a subclass has a new ``forward`` beside ``stages`` and ``features`` that it inherits."""
+    """Whether a subclass overrides ``forward`` but inherits ``stages`` and ``features``."""
 
-    def depth(name: str) -> int:  # 0 as well for what is no attribute of a class
+    def depth(name: str) -> int:  # 0 also for an attribute that no class has
         return next((depth for depth, base in enumerate(encoder_class.__mro__) if name in vars(base)), 0)
 
     return depth("forward") < min(depth("stages"), depth("features"))
@@ -305,22 +320,22 @@ def _replaces_forward_alone(encoder_class: type[nn.Module]) -> bool:
 def _check_heads(channels: int, n_heads: int) -> None:
     if channels % n_heads:
         raise ValueError(
-            f"a map of {channels} channels does not divide among {n_heads} heads; choose a divisor by "
+            f"A map of {channels} channels cannot be divided among {n_heads} heads; choose a divisor by "
             "`fusion_kwargs=dict(n_heads=...)`, or other filters in the encoders' `layers`."
         )
 
 
 def _resize(maps: th.Tensor, like: th.Tensor) -> th.Tensor:
-    """``maps`` in the rows and columns of ``like``."""
+    """Resize ``maps`` to the height and width of ``like``."""
     size = like.shape[2:]
     return maps if maps.shape[2:] == size else F.interpolate(maps, size, mode="bilinear", align_corners=False)
 
 
 def _pixels(maps: th.Tensor) -> th.Tensor:
-    """(B, C, H, W) to (B, H, W, C), a view; in channels-last memory it is contiguous."""
+    """View (B, C, H, W) as (B, H, W, C); this is contiguous if the maps are in channels-last memory."""
     return maps.permute(0, 2, 3, 1)
 
 
 def _maps(pixels: th.Tensor) -> th.Tensor:
-    """(B, H, W, C) to (B, C, H, W), a view in channels-last memory."""
+    """View (B, H, W, C) as (B, C, H, W) in channels-last memory."""
     return pixels.permute(0, 3, 1, 2)

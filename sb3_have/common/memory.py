@@ -1,4 +1,4 @@
-"""The C library's allocator, set for arrays of many megabytes."""
+"""Memory allocation for training on a CPU."""
 
 import ctypes
 
@@ -7,15 +7,15 @@ M_TRIM_THRESHOLD, M_MMAP_MAX = -1, -4  # malloc.h
 
 def keep_freed_memory() -> bool:
     """
-    Lets glibc keep freed memory for the next allocation, instead of giving it back to the system.
+    Let glibc keep freed memory for the next allocation instead of returning it to the system.
 
-    A training step on a CPU allocates and frees activations of many megabytes; by default the system takes them back
-    and has to clear every page again in the next step, which can cost a third of it (``benchmarks.update_speed``). The
-    process then never shrinks below its peak. Programs call this, before they train; a library should not, so
-    :class:`~sb3_have.HAVESAC` does not. In the shell, the same is
+    A training step on a CPU allocates and frees many megabytes of activations. By default glibc returns them to the
+    system, which clears every page again in the next step; this can take a third of the step
+    (``benchmarks.update_speed``). With this setting the process never shrinks below its peak, so a program should call
+    it before training, but a library should not, and :class:`~sb3_have.HAVESAC` does not. The equivalent in a shell is
     ``MALLOC_MMAP_MAX_=0 MALLOC_TRIM_THRESHOLD_=100000000000``.
 
-    :return: whether there was such an allocator (Linux with glibc)
+    :return: Whether the allocator has this setting (Linux with glibc)
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

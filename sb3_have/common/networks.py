@@ -1,4 +1,4 @@
-"""Several small networks of equal shape, evaluated together by batched matrix products."""
+"""Several small networks of the same shape, evaluated together by batched matrix products."""
 
 import math
 from collections.abc import Sequence
@@ -11,17 +11,17 @@ class ParallelLinear(nn.Module):
     """
     ``n_nets`` independent linear layers, applied at once: input (n_nets, batch, in), output (n_nets, batch, out).
 
-    Each net is initialised as ``torch.nn.Linear`` initialises one.
+    Each layer is initialised as in ``torch.nn.Linear``.
 
-    :param n_nets: number of layers side by side
-    :param in_features: size of each input
-    :param out_features: size of each output
+    :param n_nets: Number of layers
+    :param in_features: Size of each input
+    :param out_features: Size of each output
     """
 
     def __init__(self, n_nets: int, in_features: int, out_features: int):
         super().__init__()
         bound = 1 / math.sqrt(in_features)
-        # Registered before they are filled, so that `load_policy` can refuse sizes while they take no memory yet
+        # Register parameters before filling them, so that `load_policy` can check their sizes before memory is used
         self.weight = nn.Parameter(th.empty(n_nets, in_features, out_features))
         self.bias = nn.Parameter(th.empty(n_nets, 1, out_features))
         for parameter in (self.weight, self.bias):
@@ -35,11 +35,11 @@ class ParallelMLP(nn.Sequential):
     """
     ``n_nets`` independent multi-layer perceptrons: input (n_nets, batch, in), output (n_nets, batch, out).
 
-    :param n_nets: number of networks side by side
-    :param in_features: size of each input
-    :param out_features: size of each output
-    :param net_arch: widths of the hidden layers
-    :param activation_fn: activation between the layers
+    :param n_nets: Number of networks
+    :param in_features: Size of each input
+    :param out_features: Size of each output
+    :param net_arch: Widths of the hidden layers
+    :param activation_fn: Activation function
     """
 
     def __init__(

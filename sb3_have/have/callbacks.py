@@ -1,4 +1,4 @@
-"""What the agent looks at while it learns, in SB3's logger."""
+"""Callback that logs the weights of the modalities."""
 
 from __future__ import annotations
 
@@ -21,35 +21,36 @@ from sb3_have.evaluation.recording import record_episode, weighing
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+# Outputs of SB3's logger that do not support histograms and images
 NOT_TEXT = ("stdout", "log", "json", "csv")
-"""Outputs of SB3's logger that take no histograms and images."""
 
 
 class ModalityWeightsCallback(BaseCallback):
     """
-    Logs how much each modality counts: ``have/weight_<modality>``, the mean of the latest weights, and in TensorBoard
-    their histograms ``have/weights_<modality>``; at intervals an episode, ``have/episode``: the frames of each modality
-    over the weights (as the paper's Fig. 5).
+    Callback for logging the weights of the modalities.
 
-    The weights are those of the observations that the agent acts on, of all environments, read every ``read_freq``
-    steps: one pass through the encoders each, and unlike a sample of the replay buffer they say what counts now. The
-    episode is driven in an environment of its own, the same episode every time. Neither changes the run: training with
-    and without the callback gives the same weights, bit for bit.
+    It logs the mean of the latest weights as ``have/weight_<modality>`` and, in TensorBoard, their histograms as
+    ``have/weights_<modality>``. At intervals it also logs an episode as ``have/episode``: the frames of each modality
+    above their weights (as in Fig. 5 of the paper).
+
+    The weights are computed every ``read_freq`` steps from the observations that the agent acts on, in all
+    environments, which costs one pass through the encoders. The episode is always the same one, driven in a separate
+    environment. The callback does not change the training: with and without it, the parameters are equal bit for bit.
 
     With ``value_estimation="gve"``, which has no weights, the callback warns and does nothing.
 
-    :param read_freq: steps of each environment from one reading to the next
-    :param window: readings that mean and histograms are of, like SB3's ``stats_window_size``
-    :param eval_env: id of the environment for the episode, made each time, or a (not vectorized) environment; not
-        the one that is trained in. Frame stack and normalisation follow from the training.
-    :param episode_freq: steps from one episode to the next, counted over all environments; 0 for none
-    :param weather: of the episode, for ids of environments that have the keyword
-    :param env_kwargs: further keywords for ``gym.make``, the same as in training
-    :param seed: of the episode
-    :param max_steps: of the episode that are recorded at most
-    :param folder: where each episode is also kept as ``weights-<step>.png``, for those without TensorBoard
-    :param verbose: as in SB3
-    :raises ValueError: if numbers are out of range, or there is no ``eval_env`` for the episodes
+    :param read_freq: Compute the weights every ``read_freq`` steps of each environment
+    :param window: Number of readings in means and histograms, similar to SB3's ``stats_window_size``
+    :param eval_env: The environment for the episode: its id, or a (not vectorized) environment other than the training
+        environment. Frame stack and normalization are those of the training.
+    :param episode_freq: Drive the episode every ``episode_freq`` steps, counted over all environments; 0 for never
+    :param weather: Weather of the episode, for environment ids that have this keyword
+    :param env_kwargs: Additional keyword arguments for ``gym.make``, the same as in training
+    :param seed: Seed of the episode
+    :param max_steps: Maximum number of steps of the episode
+    :param folder: Folder in which to save each episode as ``weights-<step>.png``
+    :param verbose: Verbosity level
+    :raises ValueError: if a number is out of range, or if ``eval_env`` is missing
     """
 
     def __init__(
@@ -72,11 +73,11 @@ class ModalityWeightsCallback(BaseCallback):
             ("episode_freq", episode_freq, 0),
         ):
             if not (isinstance(value, int) and value >= least):
-                raise ValueError(f"{name}={value!r}: expected a whole number, {least} or more.")
+                raise ValueError(f"{name}={value!r}: expected a whole number >= {least}.")
         if episode_freq and eval_env is None:
             raise ValueError(
-                f"episode_freq={episode_freq} needs eval_env, an environment other than the one that is trained in: "
-                'its id, such as eval_env="HighwayVision-v0", or one that was made.'
+                f"episode_freq={episode_freq} needs an eval_env other than the training environment: an id such as "
+                'eval_env="HighwayVision-v0", or an environment.'
             )
         self.read_freq, self.window = read_freq, window
         self.eval_env, self.episode_freq = eval_env, episode_freq
@@ -99,22 +100,22 @@ class ModalityWeightsCallback(BaseCallback):
         self._weigh = weighing(self.model)
         if self._weigh is None:
             warnings.warn(
-                'ModalityWeightsCallback does nothing with value_estimation="gve": it has no weights of modalities.',
+                'ModalityWeightsCallback does nothing with value_estimation="gve": it has no weights.',
                 UserWarning,
                 stacklevel=2,
             )
             return
         trained = [env.unwrapped for env in getattr(self.training_env.unwrapped, "envs", [])]
         if isinstance(self.eval_env, gym.Env) and any(env is self.eval_env.unwrapped for env in trained):
-            raise ValueError("eval_env is the environment that is trained in: give another one, an episode resets it.")
+            raise ValueError("eval_env is the training environment; pass another one, because the episode resets it.")
 
     def _on_training_start(self) -> None:
         outputs = self.logger.output_formats
         self._tensorboard = any(isinstance(output, TensorBoardOutputFormat) for output in outputs)
         if self.episode_freq and self._weigh is not None and not self._tensorboard and self.folder is None:
             warnings.warn(
-                "ModalityWeightsCallback: no episodes are drawn, as there is no TensorBoard "
-                "(HAVESAC(..., tensorboard_log=...)) to show them, and no folder=... to keep them.",
+                "ModalityWeightsCallback logs no episodes, because there is neither TensorBoard "
+                "(HAVESAC(..., tensorboard_log=...)) nor a folder=... for them.",
                 UserWarning,
                 stacklevel=2,
             )
@@ -122,17 +123,18 @@ class ModalityWeightsCallback(BaseCallback):
         if self.folder is not None:
             self.folder.mkdir(parents=True, exist_ok=True)
         if self.eval_env is not None and self.episode_freq and self._weigh is not None:
-            with same_random_numbers():  # what does not fit is refused now, not after the first ``episode_freq`` steps
+            # Fail now if the environment does not fit, and not after ``episode_freq`` steps
+            with same_random_numbers():
                 self._record(self.model, self.eval_env, max_steps=1)
 
     def _on_step(self) -> bool:
         if self._weigh is None:
             return True
         if (self.n_calls - 1) % self.read_freq == 0:
-            # still the observation that the action of this step was chosen for
+            # `_last_obs` is still the observation for which the action of this step was chosen
             for name, weights in self._weigh(self.model._last_obs).items():
                 self._readings.setdefault(name, deque(maxlen=self.window)).append(weights)
-        # at every step, as nothing tells when the logger is dumped: after the episode's end, or by another callback
+        # Record at every step, because the logger may be dumped at any time
         for name, readings in self._readings.items():
             latest = np.concatenate(readings)
             self.logger.record(f"have/weight_{name}", float(latest.mean()))
@@ -149,7 +151,7 @@ class ModalityWeightsCallback(BaseCallback):
         return step // self.episode_freq > (step - n_envs) // self.episode_freq
 
     def _log_episode(self) -> None:
-        from sb3_have.plotting.episode import plot_modality_weights  # matplotlib takes a second to import
+        from sb3_have.plotting.episode import plot_modality_weights  # importing matplotlib takes a second
 
         assert self.eval_env is not None
         with same_random_numbers():
@@ -161,11 +163,11 @@ class ModalityWeightsCallback(BaseCallback):
         if self._tensorboard:
             self.logger.record("have/episode", Image(_pixels(figure), "HWC"), exclude=NOT_TEXT)
         if self.verbose >= 1:
-            print(f"Step {self.num_timesteps}: episode of {len(recording.infos)} steps drawn")
+            print(f"Step {self.num_timesteps}: episode of {len(recording.infos)} steps logged")
 
 
 def _pixels(figure: Figure) -> np.ndarray:
-    """uint8 (H, W, 3); not SB3's ``Figure``, which draws by pyplot."""
+    """Draw a figure to uint8 (H, W, 3). SB3's ``Figure`` would need pyplot."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     canvas = FigureCanvasAgg(figure)

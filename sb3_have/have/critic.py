@@ -1,8 +1,8 @@
 """
-The value side of HAVE: local critics per modality weighted by attention (LVE), a global critic on the fused features
-(GVE), and a hypernetwork that mixes the two by state (re-fusion).
+The critic of HAVE: local critics per modality weighted by attention (LVE), a global critic on the fused features (GVE),
+and a hypernetwork that mixes the two depending on the state (re-fusion).
 
-Shapes: B batch, K critics (twins), d modalities, F features of a modality, A action dimensions.
+Shapes: B batch, K critics (twins), d modalities, F features per modality, A action dimensions.
 Features z are (B, d, F); the global features z_g are their concatenation (B, d*F).
 """
 
@@ -26,10 +26,10 @@ REFUSIONS = ("convex", "monotone", "free")
 
 
 class Values(NamedTuple):
-    """The values of a batch and their parts; None for the parts that ``value_estimation`` leaves out."""
+    """The Q-values of a batch and their parts; a part that ``value_estimation`` does not use is None."""
 
     q: th.Tensor
-    """(K, B): the Q-value used by the actor and the target, H(q_g, q_l) for "have"."""
+    """(K, B): The Q-value used by the actor and the target, H(q_g, q_l) for "have"."""
     q_global: th.Tensor | None
     """(K, B): q_g, the global value."""
     q_local: th.Tensor | None
@@ -44,12 +44,12 @@ class LocalCritics(nn.Module):
     """
     One critic per modality and twin, Q_i^k(z_i, a): features (B, d, F) and actions (B, A) to values (K, d, B).
 
-    :param n_modalities: d
-    :param features_dim: F
-    :param action_dim: A
-    :param net_arch: widths of the hidden layers
-    :param activation_fn: activation between the layers
-    :param n_critics: K
+    :param n_modalities: Number of modalities (d)
+    :param features_dim: Number of features of each modality (F)
+    :param action_dim: Number of action dimensions (A)
+    :param net_arch: Widths of the hidden layers
+    :param activation_fn: Activation function
+    :param n_critics: Number of critics for each modality (K)
     """
 
     def __init__(
@@ -76,12 +76,12 @@ class GlobalCritic(nn.Module):
     """
     Twin critics on the concatenated features, Q_g^k(z_g, a): (B, d, F) and (B, A) to (K, B).
 
-    :param n_modalities: d
-    :param features_dim: F
-    :param action_dim: A
-    :param net_arch: widths of the hidden layers
-    :param activation_fn: activation between the layers
-    :param n_critics: K
+    :param n_modalities: Number of modalities (d)
+    :param features_dim: Number of features of each modality (F)
+    :param action_dim: Number of action dimensions (A)
+    :param net_arch: Widths of the hidden layers
+    :param activation_fn: Activation function
+    :param n_critics: Number of critics (K)
     """
 
     def __init__(
@@ -104,13 +104,14 @@ class GlobalCritic(nn.Module):
 
 class AssignmentNetwork(nn.Module):
     """
-    Attention of the fused features over the modalities: (B, d, F) to weights (B, d), positive, summing to 1.
+    Attention of the fused features over the modalities: features (B, d, F) to weights (B, d), which are positive and
+    sum to 1.
 
     Eq. 9: w = softmax_i((W_q z_g) . (W_k z_i) / sqrt(p)).
 
-    :param n_modalities: d
-    :param features_dim: F
-    :param attention_dim: p
+    :param n_modalities: Number of modalities (d)
+    :param features_dim: Number of features of each modality (F)
+    :param attention_dim: Size of queries and keys (p)
     """
 
     def __init__(self, n_modalities: int, features_dim: int, attention_dim: int = 32):
@@ -126,21 +127,21 @@ class AssignmentNetwork(nn.Module):
 
 class RefusionNetwork(nn.Module):
     """
-    H(q_g, q_l; z_g) with weights from hypernetworks of the fused features (section 3.4): (K, B), (K, B), (B, d, F) to
-    (K, B).
+    H(q_g, q_l; z_g), whose weights are outputs of hypernetworks on the fused features (section 3.4): (K, B), (K, B) and
+    (B, d, F) to (K, B).
 
     - "convex": H = b_g q_g + b_l q_l, (b_g, b_l) = softmax of a linear layer of z_g, without state bias. The
       gradients in q_g and q_l are positive (Remark 1), and mixing both sides of the Bellman equation (Eq. 10)
       changes nothing.
-    - "monotone": a two-layer perceptron on (q_g, q_l), its weights and biases given by one linear layer each, the
-      weights made positive by softplus: the gradients are positive too. The hidden units are leaky ReLUs and not
-      ELUs, which go flat where values are far below zero.
+    - "monotone": a two-layer perceptron on (q_g, q_l). One linear layer each computes its weights and biases, and
+      softplus makes the weights positive, so that the gradients are positive too. The activations are leaky ReLUs
+      because ELUs go flat where values are far below zero.
     - "free": the same without the constraint, as in the paper.
 
-    :param n_modalities: d
-    :param features_dim: F
+    :param n_modalities: Number of modalities (d)
+    :param features_dim: Number of features of each modality (F)
     :param refusion: "convex", "monotone" or "free"
-    :param hidden_dim: hidden units of "monotone" and "free"
+    :param hidden_dim: Number of hidden units of "monotone" and "free"
     """
 
     def __init__(self, n_modalities: int, features_dim: int, refusion: str = "convex", hidden_dim: int = 8):
@@ -242,14 +243,14 @@ class MultiModalCritic(BaseModel):
         return Values(q, q_global, q_local, q_lve, weights)
 
     def min_q(self, features: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        """The minimum over the twins after mixing, (B,), which the actor and the target use."""
+        """Return the minimum over the twins after mixing (B,), as used by the actor and the target."""
         return self.values(features, actions).q.min(dim=0).values
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         return tuple(self.values(self.encoder(obs), actions).q.unsqueeze(2))
 
     def weights(self, features: th.Tensor) -> th.Tensor:
-        """The weights of the modalities (B, d), Eq. 9, for features (B, d, F)."""
+        """Compute the weights of the modalities (B, d) from features (B, d, F), Eq. 9."""
         if self.value_estimation == "gve":
             raise ValueError('value_estimation="gve" has no weights of modalities: train with "have" or "lve".')
         return self.assignment(features)  # type: ignore[no-any-return]
@@ -268,10 +269,10 @@ class MultiModalCritic(BaseModel):
 
 def drop_modalities(features: th.Tensor, probability: float) -> th.Tensor:
     """
-    Zero each modality of each sample with a probability, but always keep at least one.
+    Zero the features of each modality of each sample at random, but always keep at least one modality.
 
     :param features: (B, d, F)
-    :param probability: in [0, 1)
+    :param probability: Probability of zeroing, in [0, 1)
     """
     if probability == 0:
         return features

@@ -224,8 +224,7 @@ class SquashedGaussian(SquashedDiagGaussianDistribution):
     """SB3's distribution without PyTorch's check for NaN on a GPU, which would make the host wait in every step."""
 
     def proba_distribution(self: SelfGaussian, mean_actions: th.Tensor, log_std: th.Tensor) -> SelfGaussian:
-        validate_args = None if mean_actions.device.type == "cpu" else False
-        self.distribution = Normal(mean_actions, log_std.exp(), validate_args=validate_args)
+        self.distribution = Normal(mean_actions, log_std.exp(), validate_args=mean_actions.device.type == "cpu")
         return self
 
 
