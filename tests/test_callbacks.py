@@ -156,7 +156,7 @@ def test_steps_of_several_environments_do_not_jump_over_an_episode(tmp_path: Pat
 
 def test_without_a_place_for_it_no_episode_is_driven() -> None:
     env = RandomSensors(vectors_space())
-    with pytest.warns(UserWarning, match="no TensorBoard"):
+    with pytest.warns(UserWarning, match="neither TensorBoard"):
         learn(tiny_model(vectors_space()), ModalityWeightsCallback(eval_env=env, episode_freq=5), steps=12)
     assert not hasattr(env, "steps")
 
@@ -174,7 +174,7 @@ def test_bad_arguments() -> None:
     for name in ("read_freq", "window"):
         with pytest.raises(ValueError, match=f"{name}=0"):
             ModalityWeightsCallback(**{name: 0})  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="needs eval_env"):
+    with pytest.raises(ValueError, match="needs an eval_env"):
         ModalityWeightsCallback(episode_freq=10)
     env = RandomSensors(vectors_space())
     callback = ModalityWeightsCallback(eval_env=env, episode_freq=10)

@@ -213,7 +213,7 @@ def test_losses_are_read_when_logs_are_dumped(monkeypatch: pytest.MonkeyPatch) -
     assert isinstance(model.logger.name_to_value["train/critic_loss"], th.Tensor)
     dumped: dict[str, Any] = {}
     monkeypatch.setattr(type(model.logger), "dump", lambda self, step: dumped.update(self.name_to_value))
-    model.start_time, model.ep_info_buffer, model.ep_success_buffer = 0, [], []  # type: ignore[assignment]
+    model.start_time, model.ep_info_buffer, model.ep_success_buffer = 0, [], []
     model.dump_logs()
     assert type(dumped["train/critic_loss"]) is float and dumped["train/critic_loss"] == on_cpu
 

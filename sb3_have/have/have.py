@@ -350,13 +350,15 @@ class HAVESAC(SAC):
                 actor_loss = (ent_coef * log_prob - min_q_pi).mean()
                 actor_losses.append(actor_loss.detach())
 
-                # Optimize the actor; `actor_loss.backward()` would also compute the gradients of the critic
+                # Optimize the actor. `actor_loss.backward()` would also compute the gradients of the critic, which takes
+                # 16 ms instead of 12 in an update of 246 ms (64 px, one core of an AMD Zen 3)
                 gradients = th.autograd.grad(actor_loss, actor_parameters, allow_unused=True)
                 for parameter, gradient in zip(actor_parameters, gradients, strict=True):
                     parameter.grad = gradient
                 self.actor.optimizer.step()
 
-            # Update target networks: encoder, all critics, assignment and re-fusion
+            # Update target networks: encoder, all critics, assignment and re-fusion. One call for all parameters takes
+            # 0.9 ms instead of the 1.7 ms of `polyak_update`
             if self._n_updates % self.target_update_interval == 0:
                 with th.no_grad():
                     th._foreach_lerp_(target_parameters, critic_parameters, self.tau)
