@@ -13,6 +13,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
 
 from sb3_have import HAVESAC
+from sb3_have.common.encoders import MultiModalEncoder
 
 
 def refused(call: Callable[[], Any], *parts: str) -> str:
@@ -28,16 +29,8 @@ def refused(call: Callable[[], Any], *parts: str) -> str:
 # -- When the model is built
 
 
-@pytest.mark.parametrize(
-    "space", [spaces.Discrete(3), spaces.MultiBinary(4), spaces.MultiDiscrete([2, 3])], ids=lambda s: type(s).__name__
-)
-def test_subspaces_other_than_box(space: spaces.Space[Any]) -> None:
-    observation = spaces.Dict({"gear": space, "state": vector(2)})
-    refused(lambda: tiny_model(observation), "'gear'", "Box", type(space).__name__, "one-hot")
-
-
-def test_a_single_space_other_than_box() -> None:
-    refused(lambda: tiny_model(spaces.Discrete(3)), "Box", "Discrete(3)", "one-hot")
+def test_spaces_that_cannot_be_encoded() -> None:
+    refused(lambda: MultiModalEncoder(spaces.Dict({"name": spaces.Text(5)})), "'name'", "flatten")
 
 
 def test_unknown_keys_in_modalities() -> None:

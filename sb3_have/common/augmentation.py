@@ -2,6 +2,7 @@
 
 from typing import Any, TypeVar
 
+import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.type_aliases import DictReplayBufferSamples, PyTorchObs, ReplayBufferSamples
@@ -88,7 +89,7 @@ def check_random_shift(space: spaces.Space[Any], pixels: int, n_copies: int) -> 
     :raises ValueError: if they are out of range, if there are no images, or if an image is smaller than the shift
     """
     for name, value, least in [("random_shift", pixels, 0), ("n_augmentations", n_copies, 1)]:
-        if not isinstance(value, int) or isinstance(value, bool) or value < least:
+        if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
             raise ValueError(f"{name}={value!r}: expected a whole number >= {least}.")
     if pixels == 0:
         if n_copies > 1:

@@ -223,11 +223,7 @@ class ModalityReplayBuffer(ReplayBuffer):
     def _gather(self, slots: np.ndarray, env: VecNormalize | None) -> tuple[dict[str, th.Tensor], dict[str, th.Tensor]]:
         """Return observations and next observations from their slots (2, batch, k)."""
         self.pool.to(self.device)
-        pairs = {}
-        for key, shape in self.shapes.items():
-            key_slots = slots if key in self.stacked_keys else slots[:, :, -1]  # other keys are in the newest slot
-            frames = self.pool.gather(key, key_slots.ravel(), pin_memory=self.device.type == "cuda")
-            pairs[key] = frames.view(2, -1, *shape)
+        pairs = self._frames(slots)
         obs, next_obs = ({key: pair[i] for key, pair in pairs.items()} for i in range(2))
         if env is not None and env.norm_obs:
             obs, next_obs = obs | self._normalized(obs, env), next_obs | self._normalized(next_obs, env)
@@ -235,6 +231,15 @@ class ModalityReplayBuffer(ReplayBuffer):
             {key: self._to_device(value) for key, value in obs.items()},
             {key: self._to_device(value) for key, value in next_obs.items()},
         )
+
+    def _frames(self, slots: np.ndarray) -> dict[str, th.Tensor]:
+        """Stacks from their slots (m, n, k), as (m, n, ...) for each key."""
+        stacks = {}
+        for key, shape in self.shapes.items():
+            key_slots = slots if key in self.stacked_keys else slots[:, :, -1]  # other keys are in the newest slot
+            frames = self.pool.gather(key, key_slots.ravel(), pin_memory=self.device.type == "cuda")
+            stacks[key] = frames.view(*slots.shape[:2], *shape)
+        return stacks
 
     def _normalized(self, observations: dict[str, th.Tensor], env: VecNormalize) -> dict[str, th.Tensor]:
         """Return the keys that VecNormalize normalizes, without the others, because it copies whatever it is given."""
@@ -272,6 +277,28 @@ class ModalityReplayBuffer(ReplayBuffer):
         returns = (rewards * discounts * (np.arange(self.n_steps) < n_rewards[:, None])).sum(axis=1)
         last_inds = (batch_inds + n_rewards - 1) % self.buffer_size
         return last_inds, returns, self.gamma ** n_rewards.astype(np.float32)
+
+    @property
+    def observations(self) -> Observation:  # type: ignore[override]
+        """All observations as in SB3's buffers, (buffer_size, n_envs, ...) for each key; they are copied out."""
+        return self._all_observations(0)
+
+    @property
+    def next_observations(self) -> Observation:  # type: ignore[override]
+        """All next observations, like :attr:`observations`."""
+        return self._all_observations(1)
+
+    def _all_observations(self, which: int) -> Observation:
+        size = self.buffer_size, self.n_envs
+        if self.pool.n_used == 0:
+            arrays = {key: np.zeros((*size, *shape), self.pool.dtypes[key]) for key, shape in self.shapes.items()}
+        else:
+            slots = self.slots[:, :, which].reshape(1, -1, self.n_stack)
+            arrays = {
+                key: frames.cpu().numpy().reshape(*size, *self.shapes[key])
+                for key, frames in self._frames(slots).items()
+            }
+        return arrays if isinstance(self.observation_space, spaces.Dict) else arrays["observation"]
 
     def truncate_last_trajectory(self) -> None:
         """Make n-step returns stop at the last stored transition, as needed after loading the buffer."""

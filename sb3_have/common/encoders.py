@@ -3,102 +3,28 @@
 from collections.abc import Mapping, Sequence
 from functools import cache
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
 import torch as th
 import torch.nn.functional as F
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import is_image_space, is_image_space_channels_first
+from stable_baselines3.common.preprocessing import (
+    preprocess_obs,
+)
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
 from sb3_have.common.fusion import encode_fused, make_fusions
+from sb3_have.common.validation import MIN_IMAGE_SIZE, Modality, check_known, make_modality
 
 # One event is 0.125, about the contrast of a clearly visible edge in an image scaled to [0, 1]
 EVENT_SCALE = 1 / 8
 PRECISIONS = ("auto", "float32", "bfloat16")
 # Images of at least this many pixels get the paper's encoder by default, smaller ones that of the Nature DQN
 PAPER_ENCODER_MIN_SIZE = 112
-
-
-class Modality(NamedTuple):
-    """A group of observation keys that share an encoder."""
-
-    keys: tuple[str, ...]
-    space: spaces.Box
-    is_image: bool
-
-
-def make_modality(name: str, keys: Sequence[str], space: spaces.Dict, normalize_images: bool) -> Modality:
-    """
-    Check that an encoder can read these observations, and return their joint space.
-
-    :param name: Name of the modality
-    :param keys: Its observation keys
-    :param space: Observation space
-    :param normalize_images: Whether images have to be uint8
-    :raises ValueError: if an observation cannot be encoded, or they cannot be encoded together
-    """
-    if isinstance(keys, str) or not keys:
-        raise ValueError(f"modality {name!r}: expected a non-empty list of observation keys, got {keys!r}.")
-    check_known(f"modality {name!r}", keys, space.spaces)
-    boxes = [_check_box(key, space[key], normalize_images) for key in keys]
-    is_image = [len(box.shape) == 3 for box in boxes]
-    if len(keys) == 1:
-        return Modality(tuple(keys), boxes[0], is_image[0])
-    shapes = {key: box.shape for key, box in zip(keys, boxes, strict=True)}
-    if all(is_image) and len({shape[1:] for shape in shapes.values()}) == 1:
-        shape = (sum(box.shape[0] for box in boxes), *boxes[0].shape[1:])
-        dtypes = {box.dtype for box in boxes}
-        if dtypes == {np.dtype(np.uint8)}:
-            return Modality(tuple(keys), spaces.Box(0, 255, shape, np.uint8), True)
-        return Modality(tuple(keys), spaces.Box(-np.inf, np.inf, shape, np.float32), True)
-    if not any(is_image):
-        size = sum(int(np.prod(box.shape)) for box in boxes)
-        return Modality(tuple(keys), spaces.Box(-np.inf, np.inf, (size,), np.float32), False)
-    raise ValueError(
-        f"modality {name!r}: its keys must be images of one height and width, or all vectors, got {shapes}; "
-        "make each of them a modality."
-    )
-
-
-def _check_box(key: str, space: spaces.Space[Any], normalize_images: bool) -> spaces.Box:
-    where = f"observation key {key!r}"
-    if not isinstance(space, spaces.Box):
-        raise ValueError(
-            f"{where}: expected a Box (an image or a vector), got {space}; encode it as numbers, e.g. "
-            "by a wrapper that flattens or one-hot encodes this key (gymnasium.spaces.utils.flatten)."
-        )
-    if len(space.shape) == 2 and space.dtype == np.uint8:
-        raise ValueError(
-            f"{where}: expected an image (H, W, C) or a vector, got {space.dtype} of shape {space.shape}; give a grey "
-            "image a channel axis (gymnasium.wrappers.ReshapeObservation, or image[..., None])."
-        )
-    if len(space.shape) != 3:
-        return space
-    if normalize_images and not is_image_space(space):
-        raise ValueError(
-            f"{where}: expected a uint8 image with bounds 0..255, got {space.dtype} of shape {space.shape} in "
-            f"[{space.low.min()}, {space.high.max()}]; convert it to uint8 (under "
-            "VecNormalize, leave it out of `norm_obs_keys`), or pass "
-            "`policy_kwargs=dict(normalize_images=False)` to feed channel-first images as they are."
-        )
-    if not is_image_space_channels_first(space):
-        raise ValueError(
-            f"{where}: expected a channel-first image (C, H, W), got shape {space.shape}; SB3 transposes uint8 images "
-            "with bounds 0..255 by itself, others have to be transposed by the environment."
-        )
-    return space
-
-
-def check_known(where: str, names: Sequence[str] | Mapping[str, Any], known: Sequence[str] | Mapping[str, Any]) -> None:
-    """Raise a ValueError about ``where`` if some of the ``names`` are not ``known``."""
-    unknown = [name for name in names if name not in known]
-    if unknown:
-        raise ValueError(f"{where}: unknown {', '.join(map(repr, unknown))}; known are {', '.join(map(repr, known))}.")
 
 
 class ImageEncoder(nn.Module):
@@ -174,7 +100,7 @@ def default_layers(size: int) -> list[tuple[int, int, int]]:
         return [(32, 3, 2), (32, 3, 1), (32, 3, 1), (32, 3, 1)]
     if size >= 36:
         return [(32, 8, 4), (64, 4, 2), (64, 3, 1)]
-    if size >= 15:
+    if size >= MIN_IMAGE_SIZE:
         return [(32, 3, 2), (64, 3, 2), (64, 3, 1)]
     raise ValueError(
         f"The default image encoders need at least 15x15 pixels, got {size}: enlarge the image, "
@@ -210,8 +136,10 @@ class MultiModalEncoder(nn.Module):
     training see the same numbers. uint8 images are divided by 255. Images of signed counts (128 means none, as for an
     event camera) become ``(value - 128) / 8``; 0 means "no data" and decodes to 0 like "no event", because frame
     stacking pads with zeros at reset. Vectors are taken as they are, and all images with ``normalize_images=False``.
+    Discrete, MultiDiscrete and MultiBinary observations are vectors, encoded one-hot as in SB3.
 
-    :param observation_space: Dict of Boxes (channel-first images), or one Box, a single modality named ``observation``
+    :param observation_space: Dict of images (channel-first Box), vectors and discrete spaces, or one such space, a
+        single modality named ``observation``
     :param features_dim: Number of features of each modality (F)
     :param modalities: The observation keys of each modality, such as
         ``{"vision": ["rgb", "depth"], "event": ["event"]}``. The keys of a modality are all images of one size or all
@@ -227,6 +155,8 @@ class MultiModalEncoder(nn.Module):
         "transfuser", "efnet", or a custom class, see :mod:`sb3_have.common.fusion`. All modalities must be images.
     :param fusion_kwargs: Keyword arguments for the fusion, and ``stages``, the convolutions after which it is applied,
         each time with its own parameters: "last" (default), "all", or their numbers starting at 0
+    :param channels_first: Whether to read images as (channels, height, width) even if their shape does not show which
+        axis holds the channels, because there are almost as many channels as rows or columns
     :raises ValueError: for a space, key or modality that cannot be encoded
     """
 
@@ -242,6 +172,7 @@ class MultiModalEncoder(nn.Module):
         precision: str = "auto",
         fusion: str | type[nn.Module] = "concat",
         fusion_kwargs: Mapping[str, Any] | None = None,
+        channels_first: bool = False,
     ):
         super().__init__()
         if precision not in PRECISIONS:
@@ -252,7 +183,8 @@ class MultiModalEncoder(nn.Module):
         if modalities is None:
             modalities = {key: [key] for key in keys}
         self.modalities = {
-            name: make_modality(name, group, observation_space, normalize_images) for name, group in modalities.items()
+            name: make_modality(name, group, observation_space, normalize_images, channels_first)
+            for name, group in modalities.items()
         }
         if not self.modalities:
             raise ValueError("`modalities` is empty: name at least one modality and its observation keys.")
@@ -265,6 +197,9 @@ class MultiModalEncoder(nn.Module):
             check_known(
                 "signed_keys", signed_keys, [key for key in keys if len(observation_space[key].shape or ()) == 3]
             )
+        self.discrete_spaces = {
+            key: space for key, space in observation_space.spaces.items() if not isinstance(space, spaces.Box)
+        }
         self.features_dim = features_dim
         self.signed_keys = frozenset(signed_keys)
         self.normalize_images = normalize_images
@@ -326,6 +261,8 @@ class MultiModalEncoder(nn.Module):
         self, key: str, observation: th.Tensor, is_image: bool, dtype: th.dtype, block_size: int = 1
     ) -> th.Tensor:
         if not is_image:
+            if key in self.discrete_spaces and not observation.is_floating_point():  # else SB3 has encoded it
+                observation = one_hot(observation, self.discrete_spaces[key])
             return observation.to(dtype).flatten(start_dim=1)
         signed = key in self.signed_keys
         # A traced graph cannot contain the look-up table, which is a NumPy array
@@ -385,6 +322,17 @@ class MultiModalExtractor(BaseFeaturesExtractor):
                 "`policy_kwargs=dict(features_extractor_class=MultiModalExtractor, normalize_images=False)`."
             )
         self._has_seen_bytes = bool((images > 1).any())  # never true of images that SB3 has scaled
+
+
+def one_hot(observations: th.Tensor, space: spaces.Space[Any]) -> th.Tensor:
+    """Encode the observations (B, ...) of a discrete space as SB3 does, and also where its values start at another
+    number than 0."""
+    if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
+        observations = observations - th.as_tensor(space.start, device=observations.device)
+    if isinstance(space, spaces.MultiDiscrete):
+        observations = observations.flatten(start_dim=1)
+    encoded: th.Tensor = preprocess_obs(observations, space, normalize_images=False)  # type: ignore[assignment]
+    return encoded
 
 
 def decode_bytes(values: th.Tensor, signed: bool) -> th.Tensor:

@@ -72,7 +72,7 @@ class ModalityWeightsCallback(BaseCallback):
             ("window", window, 1),
             ("episode_freq", episode_freq, 0),
         ):
-            if not (isinstance(value, int) and value >= least):
+            if not (isinstance(value, int | np.integer) and value >= least):
                 raise ValueError(f"{name}={value!r}: expected a whole number >= {least}.")
         if episode_freq and eval_env is None:
             raise ValueError(

@@ -212,6 +212,7 @@ class MultiModalCritic(BaseModel):
         if refusion not in REFUSIONS:
             raise ValueError(f"refusion={refusion!r}: expected one of {REFUSIONS}.")
         self.value_estimation = value_estimation
+        self.n_critics = n_critics
         self.encoder = encoder
         n_modalities, features_dim = len(encoder.modalities), encoder.features_dim
         heads = (n_modalities, features_dim, get_action_dim(action_space), net_arch, activation_fn, n_critics)
@@ -248,6 +249,10 @@ class MultiModalCritic(BaseModel):
 
     def forward(self, obs: PyTorchObs, actions: th.Tensor) -> tuple[th.Tensor, ...]:
         return tuple(self.values(self.encoder(obs), actions).q.unsqueeze(2))
+
+    def q1_forward(self, obs: PyTorchObs, actions: th.Tensor) -> th.Tensor:
+        """Return the values (B, 1) of the first critic only, as in SB3."""
+        return self(obs, actions)[0]  # type: ignore[no-any-return]
 
     def weights(self, features: th.Tensor) -> th.Tensor:
         """Compute the weights of the modalities (B, d) from features (B, d, F), Eq. 9."""

@@ -20,9 +20,15 @@ from stable_baselines3.common.utils import polyak_update
 
 from sb3_have.common.augmentation import check_random_shift, mean_over_copies, shifted_copies
 from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
+from sb3_have.common.validation import (
+    cast_observation,
+    check_action_space,
+    check_observation,
+    check_stored_observation,
+)
 from sb3_have.have.auxiliary import AuxiliaryLoss, LatentTransitions, auxiliary_classes, auxiliary_losses
 from sb3_have.have.critic import MultiModalCritic, Values, drop_modalities
-from sb3_have.have.policies import MultiModalPolicy, check_observation, check_stored_observation
+from sb3_have.have.policies import MultiModalPolicy
 
 SelfHAVESAC = TypeVar("SelfHAVESAC", bound="HAVESAC")
 TARGETS = ("bellman", "paper")
@@ -165,22 +171,12 @@ class HAVESAC(SAC):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
-        policy_kwargs = dict(policy_kwargs or {})
-        losses = auxiliary_classes(auxiliary)
-        for name, value in [
-            ("value_estimation", value_estimation),
-            ("refusion", refusion),
-            ("auxiliary_losses", losses),
-        ]:
-            if value is not None and policy_kwargs.setdefault(name, value) != value:
-                raise ValueError(f"{name}={value!r}, but policy_kwargs has {policy_kwargs[name]!r}: give it once.")
         if env is not None:
             env = maybe_make_env(env, verbose)
-            if not isinstance(env.action_space, spaces.Box):
-                raise ValueError(
-                    f"action space: HAVESAC needs continuous actions (Box), got {env.action_space}; use a wrapper that "
-                    "maps a Box to these actions, or an algorithm for discrete actions such as SB3's DQN."
-                )
+            check_action_space(env.action_space)
+        # SB3 does not accept NumPy's integers here
+        frequency, *unit = train_freq if isinstance(train_freq, tuple) else (train_freq,)
+        train_freq = (int(frequency), *unit) if unit else int(frequency)  # type: ignore[assignment]
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]
@@ -211,20 +207,30 @@ class HAVESAC(SAC):
             device=device,
             _init_setup_model=False,
         )
+        self.value_estimation = value_estimation
+        self.refusion = refusion
+        self.auxiliary = auxiliary
         self.policy_delay = policy_delay
         self.target = target
         self.local_coef = local_coef
         self.modality_dropout = modality_dropout
         self.random_shift = random_shift
         self.n_augmentations = n_augmentations
+        losses = auxiliary_classes(auxiliary)
         self.auxiliary_coefs = {term: 1.0 for loss in losses.values() for term in loss.terms}
         self.compile = compile
         self.n_stack = 1
+        self._architecture: dict[str, Any] | None = None
         if _init_setup_model:
             self._setup_model()
 
     def _setup_model(self) -> None:
         # Check here and not in the constructor, because `load` sets attributes in between
+        if not issubclass(self.policy_class, MultiModalPolicy):
+            raise ValueError(
+                f"policy {self.policy_class.__name__}: HAVESAC needs a MultiModalPolicy; load a model of another "
+                "algorithm with the class that saved it."
+            )
         if self.target not in TARGETS:
             raise ValueError(f"target={self.target!r}: expected one of {TARGETS}.")
         if not self.local_coef >= 0:
@@ -232,7 +238,7 @@ class HAVESAC(SAC):
         if not 0 <= self.modality_dropout < 1:
             raise ValueError(f"modality_dropout={self.modality_dropout}: expected a probability in [0, 1).")
         for name in ("policy_delay", "target_update_interval"):
-            if not (isinstance(interval := getattr(self, name), int) and interval >= 1):
+            if not (isinstance(interval := getattr(self, name), int | np.integer) and interval >= 1):
                 raise ValueError(f"{name}={interval!r}: expected a whole number of updates, 1 or more.")
         check_random_shift(self.observation_space, self.random_shift, self.n_augmentations)
 
@@ -241,18 +247,51 @@ class HAVESAC(SAC):
             self.n_stack = stacked_frames(self.env)
         if self.replay_buffer_class is None and (self.n_steps > 1 or has_images(self.observation_space)):
             self.replay_buffer_class = ModalityReplayBuffer
-        given = self.n_steps, self.replay_buffer_kwargs
+        policy_kwargs = self._full_policy_kwargs()
+        given = self.n_steps, self.replay_buffer_kwargs, self.policy_kwargs
         if self.replay_buffer_class is not None and issubclass(self.replay_buffer_class, ModalityReplayBuffer):
             self.replay_buffer_kwargs = self._replay_buffer_kwargs()
             self.n_steps = 1  # SB3 would warn that it is ignored
+        self.policy_kwargs = policy_kwargs
         super()._setup_model()
-        self.n_steps, self.replay_buffer_kwargs = given
+        self.n_steps, self.replay_buffer_kwargs, self.policy_kwargs = given
 
         if self.compile:
             for module in (*self.critic.children(), *self.critic_target.children(), *self.policy.auxiliary.values()):
                 module.compile()
         if self.verbose >= 1 and has_images(self.observation_space):
             print(f"Image encoders compute in {self.critic.encoder.image_dtype(self.device)}")
+
+    def _full_policy_kwargs(self) -> dict[str, Any]:
+        """
+        The user's ``policy_kwargs`` with the arguments of HAVESAC that belong to the policy.
+
+        :raises ValueError: if an argument is given twice, is SAC's, or is not that of a model that is being loaded
+        """
+        for name in ("features_extractor_class", "features_extractor_kwargs", "share_features_extractor"):
+            if name in self.policy_kwargs:
+                raise ValueError(
+                    f"policy_kwargs: HAVESAC has no {name}, because its critic owns an encoder for each modality; use "
+                    "features_dim, modalities, encoder_classes and encoder_kwargs."
+                )
+        own = {
+            "value_estimation": self.value_estimation,
+            "refusion": self.refusion,
+            "auxiliary_losses": auxiliary_classes(self.auxiliary),
+        }
+        own = {name: value for name, value in own.items() if value is not None}
+        for name, value in own.items():
+            if self.policy_kwargs.get(name, value) != value:
+                raise ValueError(f"{name}={value!r}, but policy_kwargs has {self.policy_kwargs[name]!r}: give it once.")
+        # `load` overwrites attributes of a saved model by its keyword arguments
+        if self._architecture is not None and own != self._architecture:
+            changed = [name for name in own | self._architecture if own.get(name) != self._architecture.get(name)]
+            raise ValueError(
+                f"load: {', '.join(changed)} cannot be changed, because the saved networks depend on it; the model was "
+                f"saved with {self._architecture}."
+            )
+        self._architecture = own
+        return {**self.policy_kwargs, **own}
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         # Switch to train mode (this affects batch norm / dropout)
@@ -365,6 +404,13 @@ class HAVESAC(SAC):
                 # Copy running stats, see SB3's issue #996
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
+        # Drop the graph of the last batch, which would prevent copying the policy
+        for name, value in vars(self.actor.action_dist).items():
+            if isinstance(value, th.Tensor):
+                setattr(self.actor.action_dist, name, value.detach())
+            elif isinstance(value, th.distributions.Distribution):
+                setattr(self.actor.action_dist, name, None)
+
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         self.logger.record("train/ent_coef", self._mean(ent_coefs))
         self.logger.record("train/critic_loss", self._mean(critic_losses))
@@ -467,6 +513,11 @@ class HAVESAC(SAC):
         tb_log_name: str = "run",
         progress_bar: bool = False,
     ) -> tuple[int, BaseCallback]:
+        if any(type(part).__name__ == "ParallelTrainCallback" for part in flat_callbacks(callback)):
+            raise ValueError(
+                "ParallelTrainCallback (rl_zoo3) trains a copy of the model as SAC, which cannot use a "
+                "MultiModalPolicy: leave it out."
+            )
         result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, tb_log_name, progress_bar)
         assert self._last_obs is not None
         check_observation(self._last_obs, self.observation_space)
@@ -486,6 +537,9 @@ class HAVESAC(SAC):
     ) -> None:
         """Refuse NaN before it reaches the replay buffer, from where it would silently spoil the networks."""
         # After an episode's end, new_obs is the first observation of the next one
+        for info in infos:
+            if "terminal_observation" in info:
+                info["terminal_observation"] = cast_observation(info["terminal_observation"], self.observation_space)
         last_observations = [info["terminal_observation"] for info in infos if "terminal_observation" in info]
         for observation in [new_obs, *last_observations]:
             check_observation(observation, self.observation_space)
@@ -514,6 +568,15 @@ class HAVESAC(SAC):
             self.replay_buffer.n_steps, self.replay_buffer.gamma = kwargs["n_steps"], kwargs["gamma"]
             if truncate_last_traj:
                 self.replay_buffer.truncate_last_trajectory()
+
+
+def flat_callbacks(callback: MaybeCallback) -> list[Any]:
+    """The callback, or the callbacks of a list, and all that they contain."""
+    parts = callback if isinstance(callback, list) else getattr(callback, "callbacks", None)
+    if parts is not None:
+        return [inner for part in parts for inner in flat_callbacks(part)]
+    child = getattr(callback, "callback", None)
+    return [callback, *(flat_callbacks(child) if isinstance(child, BaseCallback) else [])]
 
 
 def has_images(space: spaces.Space[Any]) -> bool:

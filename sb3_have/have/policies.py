@@ -15,6 +15,7 @@ from torch import nn
 from torch.distributions import Normal
 
 from sb3_have.common.encoders import MultiModalEncoder
+from sb3_have.common.validation import check_observation
 from sb3_have.have.auxiliary import AuxiliaryLoss, DeepMDP
 from sb3_have.have.critic import MultiModalCritic
 
@@ -55,6 +56,7 @@ class MultiModalPolicy(SACPolicy):
     :param fusion: Fusion of feature maps between the encoders: "concat" (none), "transfuser", "efnet", or a custom
         class, see :mod:`sb3_have.common.fusion`
     :param fusion_kwargs: Keyword arguments for the fusion, and ``stages``, the convolutions after which it is applied
+    :param channels_first: Whether to read images as (channels, height, width) even if their shape is ambiguous
     :param value_estimation: "have", "lve" or "gve", see :class:`~sb3_have.have.critic.MultiModalCritic`
     :param refusion: "convex", "monotone" or "free", see :class:`~sb3_have.have.critic.RefusionNetwork`
     :param attention_dim: Size of the queries and keys of the assignment network (p in Eq. 9)
@@ -88,6 +90,7 @@ class MultiModalPolicy(SACPolicy):
         precision: str = "auto",
         fusion: str | type[nn.Module] = "concat",
         fusion_kwargs: Mapping[str, Any] | None = None,
+        channels_first: bool = False,
         value_estimation: str = "have",
         refusion: str = "convex",
         attention_dim: int = 32,
@@ -102,6 +105,7 @@ class MultiModalPolicy(SACPolicy):
             "precision": precision,
             "fusion": fusion,
             "fusion_kwargs": fusion_kwargs,
+            "channels_first": channels_first,
         }
         self.value_kwargs: dict[str, Any] = {
             "value_estimation": value_estimation,
@@ -226,77 +230,6 @@ class SquashedGaussian(SquashedDiagGaussianDistribution):
     def proba_distribution(self: SelfGaussian, mean_actions: th.Tensor, log_std: th.Tensor) -> SelfGaussian:
         self.distribution = Normal(mean_actions, log_std.exp(), validate_args=mean_actions.device.type == "cpu")
         return self
-
-
-def check_observation(observation: np.ndarray | dict[str, np.ndarray], space: spaces.Space[Any]) -> None:
-    """
-    :param observation: one observation or a batch of them
-    :param space: the space that they belong to
-    :raises ValueError: if a key is missing or unknown, or a value has another shape, is a float image where bytes are
-        expected, or is not finite; the message names the key
-    """
-    if isinstance(space, spaces.Dict):
-        if not isinstance(observation, dict):
-            raise ValueError(
-                f"Expected a dict with the keys {list(space.spaces)}, got {type(observation).__name__}; "
-                "pass the observation as the environment returns it."
-            )
-        missing = [key for key in space.spaces if key not in observation]
-        unknown = [key for key in observation if key not in space.spaces]
-        if missing or unknown:
-            raise ValueError(
-                f"observation keys {list(observation)} do not match the {list(space.spaces)} that the policy was "
-                f"built for: missing {missing}, unknown {unknown}; give every key of the training environment "
-                "(a failed sensor's image as zeros) and no other."
-            )
-    elif isinstance(observation, dict):
-        raise ValueError(f"Expected an array of shape {space.shape}, got a dict with the keys {list(observation)}.")
-    items = observation.items() if isinstance(observation, dict) else [("observation", observation)]
-    for key, value in items:
-        _check_value(key, np.asarray(value), space[key] if isinstance(space, spaces.Dict) else space)
-
-
-def check_stored_observation(observation: np.ndarray | dict[str, np.ndarray], space: spaces.Space[Any]) -> None:
-    """
-    Under VecNormalize, SB3 stores what VecNormalize itself got, which must have its final shape already.
-
-    :param observation: a batch, as it will be stored
-    :param space: the policy's observation space
-    :raises ValueError: if VecNormalize is not the outermost wrapper that changes shapes
-    """
-    items = observation.items() if isinstance(observation, dict) else [("observation", observation)]
-    for key, value in items:
-        expected = (space[key] if isinstance(space, spaces.Dict) else space).shape
-        if value.shape[1:] != expected:
-            raise ValueError(
-                f"observation key {key!r}: VecNormalize gets the shape {value.shape[1:]}, the policy reads {expected}; "
-                "wrap in the order VecNormalize(VecTransposeImage(VecFrameStack(env, n)), norm_obs_keys=[...])."
-            )
-
-
-def _check_value(key: str, value: np.ndarray, space: spaces.Space[Any]) -> None:
-    assert space.shape is not None
-    shapes = [space.shape]
-    is_image = len(space.shape) == 3 and space.dtype == np.uint8
-    if is_image:  # SB3 transposes it, from what the environment returns to what the policy reads
-        shapes.append((*space.shape[1:], space.shape[0]))
-    if value.shape not in shapes and value.shape[1:] not in shapes:
-        raise ValueError(
-            f"observation key {key!r}: expected the shape {' or '.join(map(str, shapes))}, or a batch of it, got "
-            f"{value.shape}; give it as the training environment did (stacked, if by VecFrameStack, and of that size)."
-        )
-    if not np.issubdtype(value.dtype, np.floating):
-        return
-    if is_image:
-        raise ValueError(
-            f"observation key {key!r}: expected a uint8 image in 0..255, got {value.dtype}; convert it to uint8, or "
-            "train on float images with `policy_kwargs=dict(normalize_images=False)`."
-        )
-    if not np.isfinite(value).all():
-        raise ValueError(
-            f"observation key {key!r}: {np.count_nonzero(~np.isfinite(value))} of {np.size(value)} values are NaN "
-            "or infinite; fix the environment (SB3's VecCheckNan shows where they come from)."
-        )
 
 
 MultiInputPolicy = MultiModalPolicy
