@@ -168,9 +168,9 @@ BAD_ACTIONS = [
     spaces.Box(-10, 10, (3,), np.int64),
     spaces.Box(0, 255, (3,), np.uint8),
     spaces.Box(-BIG, BIG, (2,), np.float32),
-    spaces.Box(np.array([-1, 0.5]), np.array([1, 0.5]), (2,), np.float32),
+    spaces.Box(np.array([-1, 0.5], FLOAT), np.array([1, 0.5], FLOAT), (2,), np.float32),
     spaces.Box(-np.inf, np.inf, (2,), np.float32),
-    spaces.Box(np.array([0, -np.inf]), np.array([1, 1]), (2,), np.float32),
+    spaces.Box(np.array([0, -np.inf], FLOAT), np.array([1, 1], FLOAT), (2,), np.float32),
     spaces.Discrete(3),
     spaces.MultiDiscrete([2, 2]),
 ]
