@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from sb3_have.sensors import FAILURES, SENSORS, decode_events, failures_for
 from sb3_have.sensors import failures as f
-from sb3_have.sensors.failures import UNSIGNED
 
 Array = NDArray[Any]
 PAIRS = [(kind, sensor) for sensor in SENSORS for kind in failures_for(sensor)]
