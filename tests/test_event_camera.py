@@ -331,8 +331,8 @@ def test_bad_frames_are_refused_and_leave_no_trace() -> None:
         np.testing.assert_array_equal(events, undisturbed.step(frame, 0.1 * k))
         for bad, t, message in (
             (frame.T, k + 1.0, r"\(6, 5\), got \(5, 6\)"),
-            (np.stack([frame] * 3, axis=-1), k + 1.0, "one grey image"),
-            (np.full((6, 5), np.nan), k + 1.0, "NaN.*nan_to_num"),
+            (np.stack([frame] * 3, axis=-1), k + 1.0, "grey image"),
+            (np.full((6, 5), np.nan), k + 1.0, "NaN"),
             (-frame, k + 1.0, ">= 0.*identity"),
             (frame, 0.1 * k, r"advance.*reset\(\)"),
             (frame, float("inf"), "advance"),
