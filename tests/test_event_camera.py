@@ -13,7 +13,7 @@ from sb3_have.sensors import EVENT_DTYPE, PRESETS, EventCamera
 from sb3_have.sensors.event_camera import Mapping
 
 Event = tuple[int, int, float, int]
-#: Every part of the model at once.
+# Every part of the model at once
 EVERYTHING: dict[str, Any] = {
     "threshold": (0.15, 0.3),
     "threshold_sigma": 0.03,
@@ -35,7 +35,7 @@ def run(camera: EventCamera, frames: NDArray[Any], dt: float = 0.1) -> NDArray[A
 
 
 def loop(frames: NDArray[Any], thresholds: NDArray[Any], dt: float = 0.1) -> list[Event]:
-    """The model word by word: one pixel, one crossing at a time."""
+    """The model as a loop: one pixel and one crossing at a time."""
     _, height, width = frames.shape
     events = []
     for y in range(height):

@@ -38,9 +38,9 @@ def test_m3ed(tmp_path: Path) -> None:
         put(path, events, group, time="i8", compression="lzf")
         with h5py.File(path, "a") as file:
             file[f"{group}/calib/resolution"] = np.array([1280, 720])
-    for group in (None, "prophesee/up", "events"):
+    for wrong in (None, "prophesee/up", "events"):
         with pytest.raises(ValueError, match=r"\['prophesee/left', 'prophesee/right'\], got group="):
-            EventFile(path, group)
+            EventFile(path, wrong)
     for group, events in streams.items():
         with EventFile(path, f"/{group}") as recorded:
             assert (recorded.height, recorded.width, recorded.t_offset) == (720, 1280, 0.0)

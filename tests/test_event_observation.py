@@ -63,7 +63,7 @@ def test_the_image_is_that_of_the_camera_used_by_hand(make: Callable[..., Env]) 
     wanted = by_hand(EventCamera(HEIGHT, WIDTH, **options), frames, 0.1)  # type: ignore[arg-type]
     same(wanted, observations)
     assert (wanted[1] > 128).any() and (wanted[1] < 128).any()
-    same(wanted, episode(env))  # the second episode starts anew
+    same(wanted, episode(env))  # a second episode is the same
 
 
 def test_mappings_see_the_numbers_they_are_made_for() -> None:

@@ -114,7 +114,7 @@ def test_a_ramp_that_begins_ahead_calls_for_cars_from_behind(u: float, called: b
 
 
 def overtakings(scenario: str, u: float) -> tuple[int, float]:
-    """By whom a car that stands on the left-most lane is overtaken in a minute, and how many cars are in sight."""
+    """Vehicles that overtake a car standing on the leftmost lane within a minute, and the number of cars in sight."""
     env = BlindEnv(scenario=scenario, vehicles_count=0, max_episode_steps=None)
     env.reset(seed=0)
     place(env, RAMP_START + u, 0.0)

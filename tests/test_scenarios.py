@@ -109,7 +109,7 @@ def test_oncoming_traffic_is_met_head_on_and_brakes_but_does_not_reverse() -> No
     for _ in range(100):
         info = env.step(STRAIGHT)[4]
         assert info["end_reason"] is None and car.speed >= 0
-    # It waits for who blocks its lane.
+    # It waits for the car that blocks its lane
     assert car.speed < 0.1 and 5 < car.position[0] - ego.position[0] < 20
     ego.speed = 10.0
     for _ in range(15):

@@ -1,4 +1,4 @@
-"""SensorFailure: what happened is what info says, when it should have happened, and nothing else changed."""
+"""SensorFailure: info reports what happened, it happens when it should, and nothing else changes."""
 
 import pickle
 import threading

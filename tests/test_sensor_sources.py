@@ -34,7 +34,7 @@ def fires(env: Env) -> bool:
 @pytest.mark.parametrize("camera", [None, "noisy"])
 def test_frames_in_0_to_1_where_0_to_255_is_expected(camera: Any) -> None:
     env = flashing(1.0, camera)
-    with warnings.catch_warnings():  # a black start says nothing of the scale
+    with warnings.catch_warnings():  # the scale of a black frame is unknown
         warnings.simplefilter("error")
         env.reset(seed=0)
     with pytest.warns(UserWarning, match="float frames only reach 1, .*'lin_log' expects 0..255.*camera='ideal'"):

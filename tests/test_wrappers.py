@@ -26,7 +26,7 @@ from sb3_have.sensors import (
 
 Env = gym.Env[Any, Any]
 
-# A wrapped environment is what is checked here; gymnasium would rather have the bare one.
+# The wrapped environment is checked on purpose; Gymnasium prefers the bare one
 bare = pytest.mark.filterwarnings("ignore:.*is different from the unwrapped version:UserWarning")
 
 # Python 3.12 and later.
@@ -150,7 +150,7 @@ def test_render_shows_the_present() -> None:
     env = RenderObservation(MovingBar("rgb_array"))
     first = env.reset()[0]["rgb"]
     shown = env.render()
-    shown[:] = 0  # what a user does to a rendering is no business of the observation, nor of the next one who looks
+    shown[:] = 0  # a rendering may be modified without changing the observation or the next rendering
     assert (first == picture(0)).all()
     np.testing.assert_array_equal(env.render(), picture(0))
     env.step(np.zeros(2))

@@ -281,7 +281,7 @@ class _Projected:
 
 
 def _to_camera(points: Array, x: Array, y: Array, heading: Array) -> tuple[Array, Array]:
-    """Transform world points (..., instants, n, 2) to forward and right in the camera frame, (..., instants, n) each."""
+    """Forward and right [m] of world points (..., instants, n, 2) in the camera frame, (..., instants, n) each."""
     dx, dy = points[..., 0] - x[:, None], points[..., 1] - y[:, None]
     cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
     return cos * dx + sin * dy, cos * dy - sin * dx

@@ -178,7 +178,7 @@ def _footprint(wide: Array, long: Array, slope: Array, sin: Array, cos: Array) -
 
 
 def _share_between(x: Array, length: Array, first: float, last: float) -> Array:
-    """Share of a footprint of this length and with its centre at x that lies between two places farther apart than it."""
+    """Share of a footprint of this length, centred at x, between two places that are farther apart than that."""
     inside = np.minimum(x - np.float32(first), np.float32(last) - x)
     return np.asarray(np.clip(inside / length + np.float32(0.5), 0, 1))
 

@@ -111,11 +111,7 @@ class ShapedNetwork(RoadNetwork):
             self.add_lane(*FORWARD, self.ramp)
 
     def bend(self, x: float) -> float:
-        """
-        Return the offset of the road to the right of the x axis [m].
-
-        :param x: Position along the road [m].
-        """
+        """Offset of the road to the right of the x axis [m] at x [m]."""
         return float(self.shape.bend(x))
 
     def get_closest_lane_index(self, position: np.ndarray, heading: float | None = None) -> LaneIndex:

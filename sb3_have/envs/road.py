@@ -49,12 +49,7 @@ class AxisLane(StraightLane):
         return 0.0
 
     def occupants(self, placed: list[Placed]) -> list[tuple[float, Vehicle]]:
-        """
-        Find the vehicles on the lane or across its border.
-
-        :param placed: All vehicles.
-        :return: Position along the lane [m] and vehicle.
-        """
+        """Vehicles on the lane or across its border, with their positions along the lane [m]."""
         centre = self.centre
         return [(x, vehicle) for x, y, _, vehicle in placed if abs(y - centre) <= LANE_WIDTH / 2 + 1]
 
@@ -76,11 +71,7 @@ class HighwayNetwork(RoadNetwork):
             self.add_lane("0", "1", lane)
 
     def bend(self, x: float) -> float:
-        """
-        Return the offset of the road to the right of the x axis [m].
-
-        :param x: Position along the road [m].
-        """
+        """Offset of the road to the right of the x axis [m] at x [m]."""
         return 0.0
 
     def get_closest_lane_index(self, position: np.ndarray, heading: float | None = None) -> LaneIndex:
@@ -134,11 +125,7 @@ class HighwayRoad(Road):
         return front, rear
 
     def motion(self, vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray]:
-        """
-        Return the direction (a unit vector) and the velocity [m/s] of a vehicle.
-
-        :param vehicle: Vehicle of this road.
-        """
+        """Direction (a unit vector) and velocity [m/s] of a vehicle."""
         motion = None if self._placed is None else self._motions.get(vehicle)
         if motion is None:
             direction = vehicle.direction

@@ -73,47 +73,26 @@ class RoadShape:
         return 0.5 * self.lanes_count * self.lane_width + SHOULDER_WIDTH
 
     def bend(self, x: Any) -> Any:
-        """
-        Return the offset of the road to the right of the x axis [m].
-
-        :param x: Position along the road [m].
-        """
+        """Offset of the road to the right of the x axis [m] at x [m]."""
         return self.swing * _sin(_WAVE * x)
 
     def slope(self, x: Any) -> Any:
-        """
-        Return the derivative of :meth:`bend`, the tangent of the heading of the road.
-
-        :param x: Position along the road [m].
-        """
+        """Derivative of :meth:`bend`, the tangent of the heading of the road at x [m]."""
         return self.swing * 2 * math.pi / PERIOD * _sin(_WAVE * x + 0.5 * math.pi)
 
     def direction(self, x: float) -> tuple[float, float]:
-        """
-        Return the unit vector along the road.
-
-        :param x: Position along the road [m].
-        """
+        """Unit vector along the road at x [m]."""
         if not self.swing:
             return 1.0, 0.0
         heading = math.atan(self.slope(x))
         return math.cos(heading), math.sin(heading)
 
     def has_ramp(self, x: Any, until: float = RAMP_ENDS) -> Any:
-        """
-        Return whether there is a ramp.
-
-        :param x: Position along the road [m].
-        :param until: Only count ramps that began less than this distance before x [m].
-        """
+        """Whether there is a ramp at x [m] that began less than ``until`` [m] before."""
         return self.ramps & (x % PERIOD < until)
 
     def ramp(self, x: Any) -> tuple[Any, Any]:
-        """
-        Return the across coordinates of the left and right edge of the ramp [m]; without one, of the edge of the road.
-
-        :param x: Position along the road [m].
-        """
+        """Across coordinates [m] of the edges of the ramp at x [m]; both are the edge of the road if there is none."""
         if not self.ramps:
             return self.right_edge + 0 * x, self.right_edge + 0 * x
         u = x % PERIOD
@@ -123,11 +102,7 @@ class RoadShape:
         return left, left + self.lane_width * (1 - _positive(taper) + _positive(taper - 1))
 
     def ramp_slope(self, x: Any) -> tuple[Any, Any]:
-        """
-        Return the derivatives of the edges that :meth:`ramp` returns.
-
-        :param x: Position along the road [m].
-        """
+        """Derivatives of the edges that :meth:`ramp` returns at x [m]."""
         if not self.ramps:
             return 0 * x, 0 * x
         u = x % PERIOD
@@ -163,5 +138,5 @@ def _sin(x: Any) -> Any:
 
 
 def _positive(x: Any) -> Any:
-    """The larger of x and 0."""
+    """Larger of x and 0."""
     return 0.5 * (x + abs(x))

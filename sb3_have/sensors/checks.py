@@ -10,30 +10,17 @@ import numpy as np
 
 
 def is_number(value: Any, kind: type = Real) -> bool:
-    """
-    Check for a single number of Python or NumPy; a bool is not one.
-
-    :param value: Value to check.
-    :param kind: ``Integral`` for whole numbers only.
-    """
+    """Check for a single number of Python or NumPy, not a bool; with ``kind=Integral`` for a whole number."""
     return isinstance(value, kind) and not isinstance(value, bool)
 
 
 def is_finite(value: Any) -> bool:
-    """
-    Check for a single number that is neither infinite nor NaN.
-
-    :param value: Value to check.
-    """
+    """Check for a single number that is neither infinite nor NaN."""
     return is_number(value) and bool(-np.inf < value < np.inf)
 
 
 def is_pair(value: Any) -> bool:
-    """
-    Check for two finite numbers in a tuple, list or array.
-
-    :param value: Value to check.
-    """
+    """Check for two finite numbers in a tuple, list or array."""
     parts = value.tolist() if isinstance(value, np.ndarray) else value
     return isinstance(parts, tuple | list) and len(parts) == 2 and all(map(is_finite, parts))
 
@@ -68,11 +55,7 @@ def positive_pair(name: str, value: Any) -> tuple[float, float]:
 
 
 def describe(value: Any) -> str:
-    """
-    Describe a value in an error message: dtype and shape of an array, or the type.
-
-    :param value: Value to describe.
-    """
+    """Describe a value in an error message: dtype and shape of an array, or the type."""
     return f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
 
 

@@ -104,12 +104,7 @@ class DepthObservation(SensorWrapper):
         self._add_space(*self.image_size, 1)
 
     def sense(self, observation: Observation, start: bool) -> NDArray[np.uint8]:
-        """
-        Return the depth codes, uint8 (H, W, 1).
-
-        :param observation: Observation of the wrapped environment as a dict.
-        :param start: Not used.
-        """
+        """Return the depth codes, uint8 (H, W, 1)."""
         metres = self._metres(observation)
         if self.noise is not None:
             metres = disparity_noise(metres, self._rng, **self.noise)

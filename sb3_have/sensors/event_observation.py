@@ -137,23 +137,14 @@ class EventObservation(SensorWrapper):
         self._add_space(height, width, channels(representation, bins))
 
     def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
-        """
-        Step the environment and read the sensor.
-
-        :param action: Action of the environment.
-        """
+        """Step the environment and read the sensor."""
         if self._intermediate is None:
             return super().step(action)
         with self._intermediate:
             return super().step(action)
 
     def sense(self, observation: Observation, start: bool) -> NDArray[np.uint8]:
-        """
-        Return the events since the previous step, uint8 (H, W, channels).
-
-        :param observation: Observation of the wrapped environment as a dict.
-        :param start: Whether an episode begins.
-        """
+        """Return the events since the previous step, uint8 (H, W, channels)."""
         frames = [self._intensity(frame) for frame in self._frames(observation)]
         if start:
             self.camera.reset()

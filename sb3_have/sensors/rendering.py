@@ -74,12 +74,7 @@ class SensorWrapper(gym.Wrapper[Observation, Any, Any, Any], gym.utils.RecordCon
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """
-        Reset the environment and the sensor.
-
-        :param seed: Seed of the environment and of the sensor's noise.
-        :param options: Options of the environment.
-        """
+        """Reset the environment and the sensor; the seed is also that of the sensor's noise."""
         if seed is not None:
             self._rng = np.random.default_rng((seed, zlib.crc32(self.key.encode())))
         self._rendered = None
@@ -87,11 +82,7 @@ class SensorWrapper(gym.Wrapper[Observation, Any, Any, Any], gym.utils.RecordCon
         return self._extend(observation, start=True), info
 
     def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
-        """
-        Step the environment and read the sensor.
-
-        :param action: Action of the environment.
-        """
+        """Step the environment and read the sensor."""
         self._rendered = None
         observation, reward, terminated, truncated, info = self.env.step(action)
         return self._extend(observation, start=False), reward, terminated, truncated, info
@@ -183,12 +174,7 @@ class RenderObservation(SensorWrapper):
         self._add_space(*self.image_size, 3)
 
     def sense(self, observation: Observation, start: bool) -> NDArray[np.uint8]:
-        """
-        Return the latest frame, uint8 (H, W, 3).
-
-        :param observation: Not used.
-        :param start: Not used.
-        """
+        """Return the latest frame, uint8 (H, W, 3)."""
         # Copy, because other sensors use the same rendering
         return np.array(resize(self.look().colour[-1], self.image_size), order="C")
 
@@ -224,11 +210,7 @@ class IntermediateFrames:
 
 
 def is_highway_env(env: gym.Env[Any, Any]) -> bool:
-    """
-    Check for an environment of highway-env, by what :class:`IntermediateFrames` relies on.
-
-    :param env: Environment, wrapped or not.
-    """
+    """Check for an environment of highway-env, by what :class:`IntermediateFrames` relies on."""
     return hasattr(env.unwrapped, "set_record_video_wrapper") and hasattr(env.unwrapped, "_record_video_wrapper")
 
 
@@ -298,13 +280,7 @@ def sort_frames(mode: str, rendered: Any) -> Frames:
 
 
 def resize(image: Array, size: tuple[int, int], interpolation: int = cv2.INTER_AREA) -> Array:
-    """
-    Resize an image; its channels stay.
-
-    :param image: (H, W) or (H, W, C).
-    :param size: New rows and columns.
-    :param interpolation: Method of OpenCV.
-    """
+    """Resize an image (H, W) or (H, W, C) to these rows and columns; its channels stay."""
     if image.shape[:2] == size:
         return image
     return cv2.resize(np.ascontiguousarray(image), size[::-1], interpolation=interpolation)

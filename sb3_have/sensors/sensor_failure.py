@@ -136,12 +136,7 @@ class SensorFailure(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         self._active: bool = False
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
-        """
-        Reset the environment and the failure.
-
-        :param seed: Seed of the environment and of the failure.
-        :param options: Options of the environment.
-        """
+        """Reset the environment and the failure, both with the seed."""
         observation, info = self.env.reset(seed=seed, options=options)
         if seed is not None:
             self._seed(seed)
@@ -150,11 +145,7 @@ class SensorFailure(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         return self._fail(observation, info)
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
-        """
-        Step the environment and corrupt its observation if the failure is active.
-
-        :param action: Action of the environment.
-        """
+        """Step the environment and corrupt its observation if the failure is active."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         self._step += 1
         observation, info = self._fail(observation, info)
