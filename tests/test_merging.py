@@ -12,8 +12,8 @@ from sb3_have.envs.merging import MergingDriver
 from sb3_have.envs.road_shape import PERIOD, RAMP_JOINS, RAMP_TAPERS
 
 STRAIGHT = np.zeros(2)
+# Position at which a ramp begins [m]
 RAMP_START = 4 * PERIOD
-"""Where a ramp begins [m]."""
 
 
 def place(env: Any, x: float, y: float, heading: float = 0.0) -> None:

@@ -24,8 +24,9 @@ from sb3_have.envs.weather import WEATHERS
 Array = NDArray[Any]
 NEW = ("merge", "curves")
 STRAIGHT = np.zeros(2)
+# Position at which a ramp begins [m]
 RAMP_START = 4 * PERIOD
-"""Where a ramp begins [m]."""
+
 
 
 class RuleDrivenEnv(BlindEnv):
@@ -281,8 +282,8 @@ def test_other_numbers_of_lanes(scenario: str, lanes: int) -> None:
     [
         ({"scenario": "city"}, "highway, merge, curves; got 'city'"),
         ({"scenario": None}, "highway, merge, curves"),
-        ({"scenario": "curves", "lanes_count": 3}, "even.*got 3, choose 2 or 4"),
-        ({"scenario": "curves", "lanes_count": 1}, "even.*got 1, choose 2$"),
+        ({"scenario": "curves", "lanes_count": 3}, "even.*got 3"),
+        ({"scenario": "curves", "lanes_count": 1}, "even.*got 1"),
         ({"scenario": "curves", "simulation_frequency": 2, "policy_frequency": 1}, "simulation_frequency.*>= 3.*got 2"),
         ({"scenario": "merge", "lanes_count": 0}, "lanes_count"),
     ],
