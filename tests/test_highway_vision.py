@@ -142,7 +142,7 @@ def test_configuration_takes_effect_at_the_next_reset_after_the_same_checks() ->
         info = env.step(STRAIGHT)[4]
     assert info["distance"] == pytest.approx(2 * 30 / 5) and info["end_reason"] is None
     env.reset(seed=0)
-    assert len(env.road.vehicles) == 1 and env.shape.oncoming == 1
+    assert len(env.road.vehicles) == 1 and env.shape.oncoming == 1 and env.sub_steps == 2
     assert isinstance(env.sensors, VisionSensors) and env.sensors.camera.shape == env.shape
     ends = [env.step(STRAIGHT) for _ in range(3)]
     assert [end[4]["end_reason"] for end in ends] == [None, None, "timeout"]
