@@ -147,9 +147,11 @@ def test_configuration_takes_effect_at_the_next_reset_after_the_same_checks() ->
     ends = [env.step(STRAIGHT) for _ in range(3)]
     assert [end[4]["end_reason"] for end in ends] == [None, None, "timeout"]
     assert ends[0][4]["distance"] == pytest.approx(30 / 15, rel=0.01) and ends[0][1] == pytest.approx(1.0, rel=0.01)
+    before = dict(config)
     for bad in ({"vehicle_count": 1}, {"image_size": 36}, {"initial_speed": 40.0}, {"lanes_count": 3}):
         with pytest.raises(ValueError, match=next(iter(bad))):
             env.configure(bad)
+    assert env.config == before
     config["crash_penalty"] = -1.0
     with pytest.raises(ValueError, match="crash_penalty"):
         env.reset()
