@@ -242,6 +242,7 @@ def test_failures_change_what_is_seen_and_not_what_happens() -> None:
         ({"n_blind": -1}, "n_blind.*-1"),
         ({"n_blind": 12}, "n_blind.*12"),
         ({"failure": (3, "black")}, "modality in 0..2"),
+        ({"failure": (0, "sound")}, "'black', 'frozen', 'noise'"),
         ({"failure": (0, "dark")}, "'black', 'frozen', 'noise'"),
         ({"failure": "black"}, "must be \\(modality, condition\\)"),
     ],
