@@ -28,7 +28,6 @@ STRAIGHT = np.zeros(2)
 RAMP_START = 4 * PERIOD
 
 
-
 class RuleDrivenEnv(BlindEnv):
     """highway-env's own IDM/MOBIL driver at the wheel, whatever the action."""
 
