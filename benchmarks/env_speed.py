@@ -1,21 +1,22 @@
-"""Control steps per second of HighwayVision-v0 on one core, beside highway-env without any rendering.
+"""
+Control steps per second of HighwayVision-v0 on one core, compared with highway-env without rendering.
 
     OMP_NUM_THREADS=1 python -m benchmarks.env_speed
 
-20 vehicles, the ego keeps straight at about 15 m/s; a step is 0.1 s or, as by default, 0.2 s of simulation at 20 Hz.
-The contenders take turns in one process; those with the same traffic drive through the very same one, see
-``benchmarks/road_identity.py``. The time measured includes the resets between episodes. Rows, printed and written to
+There are 20 vehicles, and the ego vehicle keeps straight at about 15 m/s. A step is 0.1 s or 0.2 s (the default) of
+simulation at 20 Hz. The contenders take turns in one process, where possible in the same traffic (see
+``benchmarks/road_identity.py``). The time includes the resets between episodes. Rows, printed and written to
 benchmarks/results/env_speed.csv:
 
 - ``HighwayVision-v0``: for image sizes, weathers and modalities;
-- ``HighwayVision-v0, driven``: its scenarios, with an IDM/MOBIL driver at the wheel, who follows the bends; and the
-  benchmark's task, "curves" seen through the colour and the event camera, for all weathers asked for;
-- ``no sensors``: its dynamics alone; ``stock road, no sensors``: the same on highway-env's own road, with its drivers;
+- ``HighwayVision-v0, driven``: its scenarios with an IDM/MOBIL driver, who follows the bends; and the task of the
+  benchmark, "curves" with the colour and the event camera, in all chosen weathers;
+- ``no sensors``: its dynamics; ``stock road, no sensors``: the same with highway-env's own road and drivers;
 - ``highway-v0``: highway-env's environment with continuous actions and its default observation, 5 vehicles in numbers.
 
-Columns: median and quartiles of the wall-clock time of a step; ``cpu_ms``, median processor time, which says more on a
-machine with other work; ``steps_per_s`` and ``cpu_steps_per_s`` from these medians; ``vs_stock``, how many times faster
-than ``stock road, no sensors``, the median over the rounds of the ratio within a round, in processor time.
+Columns: median and quartiles of the wall-clock time of a step; ``cpu_ms``, median processor time, which is more
+reliable on a busy machine; ``steps_per_s`` and ``cpu_steps_per_s`` from these medians; ``vs_stock``, how many times
+faster than ``stock road, no sensors``, the median over the rounds of the ratio within a round, in processor time.
 """
 
 from __future__ import annotations
@@ -48,7 +49,7 @@ COLUMNS = (
 
 
 class Contender(NamedTuple):
-    """What is timed; all but the name only where there are sensors."""
+    """Environment to time; only those with sensors have more than a name."""
 
     contender: str
     image_size: int | None = None
@@ -62,7 +63,7 @@ DRIVEN = "HighwayVision-v0, driven"
 
 
 def make_env(contender: Contender, control_frequency: int, vehicles: int) -> gym.Env[Any, Any]:
-    """The contender's environment."""
+    """Create the environment of a contender."""
     frequencies = {"simulation_frequency": 20, "policy_frequency": control_frequency}
     if contender.contender == "highway-v0":
         config = {"action": {"type": "ContinuousAction"}, "lanes_count": 4, "vehicles_count": vehicles, **frequencies}
@@ -78,7 +79,7 @@ def make_env(contender: Contender, control_frequency: int, vehicles: int) -> gym
 
 
 class Driver:
-    """Keeps straight; a call is one control step."""
+    """Keeps straight; each call is one control step."""
 
     def __init__(self, env: gym.Env[Any, Any]) -> None:
         self.env = env
@@ -93,7 +94,7 @@ class Driver:
 
 
 def measure(contenders: Sequence[Contender], control_frequency: int, args: argparse.Namespace) -> list[Row]:
-    """Rows of all contenders at one control frequency."""
+    """Return one row per contender at one control frequency."""
     drivers = {contender: Driver(make_env(contender, control_frequency, args.vehicles)) for contender in contenders}
     times = interleave(drivers, args.rounds, args.steps)
     where = machine()

@@ -1,18 +1,19 @@
-"""Milliseconds per frame of the event camera, on one thread.
+"""
+Milliseconds per frame of the event camera on one thread.
 
     OMP_NUM_THREADS=1 python -m benchmarks.event_speed
 
-The film is a texture of light that moves sideways by half a pixel a frame at 100 frames/s, round and round, with a
-contrast at which an ideal camera of 128x128 pixels fires about 2,200 events a frame. The contenders take turns in one
-process. Rows, printed and written to benchmarks/results/event_speed.csv, for each ``study``:
+The film is a texture of light that moves sideways in a loop by half a pixel per frame at 100 frames/s. At its contrast
+an ideal camera of 128x128 pixels fires about 2,200 events per frame. The contenders take turns in one process. Rows,
+printed and written to benchmarks/results/event_speed.csv, for each ``study``:
 
 - ``setting``: cameras of 128x128 pixels, the presets and some of their parts;
-- ``pixels``: an ideal camera of 64x64 to 512x512 pixels on the same texture, so with events in proportion;
+- ``pixels``: an ideal camera of 64x64 to 512x512 pixels on the same texture, with proportionally many events;
 - ``events``: an ideal camera of 128x128 pixels, contrast 1 to 8 times as high.
 
 Columns: ``output``, "sorted" for ``EventCamera.step`` and "unsorted" for ``EventCamera.detect``, which is what an event
 image is made from; ``events``, mean number a frame; median and quartiles of the wall-clock time of a frame (the mean
-over a visit of one round of the film); ``cpu_ms``, median processor time, which says more on a machine with other work;
+over a visit of one round of the film); ``cpu_ms``, median processor time, which is more reliable on a busy machine;
 ``ns_per_pixel`` and ``ns_per_event``, processor time over their number.
 """
 
@@ -32,9 +33,9 @@ from sb3_have.sensors import EventCamera
 
 FRAMES = 64
 FRAME_TIME = 0.01
-#: The texture repeats after this many columns, the film after FRAMES frames.
+# The texture repeats after this many columns, the film after FRAMES frames
 TILE = 32
-#: Standard deviation of the log intensity at contrast 1.
+# Standard deviation of the log intensity at contrast 1
 CONTRAST = 0.26
 
 SETTINGS: dict[str, tuple[str, dict[str, Any]]] = {
@@ -66,13 +67,13 @@ def film(image_size: int, contrast: float, seed: int = 0) -> NDArray[np.float64]
     shifts = np.arange(FRAMES)[:, None, None] * (TILE / FRAMES)
     texture = np.fft.ifft2(spectrum * np.exp(-2j * np.pi * columns * shifts)).real
     texture = np.tile(texture / texture.std(), (1, 1, -(-image_size // TILE)))[..., :image_size]
-    # A contrast that grows across the image: equal times in every repetition of the texture would be quick to sort.
+    # Let the contrast grow across the image, because equal times in every repetition would be fast to sort
     log_light: NDArray[np.float64] = texture * np.linspace(0.7, 1.3, image_size) * contrast
     return np.asarray(0.3 * np.exp(log_light))
 
 
 class Viewer:
-    """A camera that watches the film for ever; a call is one frame and returns the number of its events."""
+    """A camera that watches the film in a loop; each call processes one frame and returns the number of its events."""
 
     def __init__(self, contender: Contender) -> None:
         preset, overrides = SETTINGS[contender.setting]
@@ -92,16 +93,16 @@ class Viewer:
 
 def measure(contenders: Sequence[Contender], rounds: int = 30, repeats: int = FRAMES) -> list[Row]:
     """
-    One row for every contender.
+    Return one row per contender.
 
-    :param contenders: what is timed
-    :param rounds: timed visits to each
-    :param repeats: frames a visit
+    :param contenders: Cameras to time.
+    :param rounds: Timed visits to each.
+    :param repeats: Frames per visit.
     """
     viewers = {contender: Viewer(contender) for contender in contenders}
     events = {}
     for contender, viewer in viewers.items():
-        for _ in range(FRAMES):  # until every pixel's reference has gone round once
+        for _ in range(FRAMES):  # until the film has passed every pixel once
             viewer()
         events[contender] = float(np.mean([viewer() for _ in range(FRAMES)]))
     rows: list[Row] = []

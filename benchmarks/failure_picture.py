@@ -1,6 +1,7 @@
-"""Draws a contact sheet of the sensor failures: every kind at its three severities on HighwayVision-v0's sensors.
+"""
+Draw a contact sheet of all sensor failures at three severities on the sensors of HighwayVision-v0.
 
-python -m benchmarks.failure_picture [--out docs/failures.png]
+    python -m benchmarks.failure_picture [--out docs/failures.png]
 """
 
 import argparse
@@ -30,7 +31,7 @@ Picture = NDArray[np.uint8]
 
 
 def drive(modality: str | None = None, kind: str = "", severity: int = 1) -> dict[str, Picture]:
-    """The observation after some seconds of keeping straight; the failure begins three steps before."""
+    """Return the observation after :data:`STEPS` steps straight ahead; the failure begins three steps before."""
     env: gym.Env[Any, Any] = gym.make("HighwayVision-v0", image_size=SIZE, weather="ClearNoon")
     if modality is not None:
         env = SensorFailure(env, modality, kind, severity, schedule=(STEPS - 3, None))
@@ -43,7 +44,7 @@ def drive(modality: str | None = None, kind: str = "", severity: int = 1) -> dic
 
 
 def sheet(kinds: tuple[str, ...] = tuple(FAILURES)) -> Picture:
-    """A row for the intact sensors and one for every kind; per sensor a column for every severity."""
+    """Draw a row for the intact sensors and one per kind, with a column per sensor and severity."""
     step = SIZE + GAP
     width = LABELS + len(MODALITIES) * (len(SEVERITIES) * step + GAP)
     paper = np.full((HEADER + (1 + len(kinds)) * step, width, 3), PAPER, np.uint8)

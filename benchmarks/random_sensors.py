@@ -1,4 +1,4 @@
-"""Random images in the shapes of a driving agent's sensors, through SB3's own wrappers: data to measure speed with."""
+"""Random images in the shapes of a driving agent's sensors, wrapped as SB3 does, to measure speed with."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Images = dict[str, NDArray[np.uint8]]
 
 class RandomSensors(gym.Env[Any, NDArray[np.float32]]):
     """
-    Random images and rewards; an episode is truncated after a number of steps.
+    Random images and rewards; episodes are truncated after a fixed number of steps.
 
-    :param channels: of each observation key
-    :param image_size: pixels along each side
-    :param episode_length: steps
-    :param seed: of the generator
+    :param channels: Channels of each observation key.
+    :param image_size: Height and width in pixels.
+    :param episode_length: Steps per episode.
+    :param seed: Seed of the generator.
     """
 
     def __init__(self, channels: Mapping[str, int], image_size: int, episode_length: int = 100, seed: int = 0):
@@ -52,7 +52,7 @@ class RandomSensors(gym.Env[Any, NDArray[np.float32]]):
 def make_env(
     channels: Mapping[str, int], image_size: int, n_stack: int = 3, episode_length: int = 100, n_envs: int = 1
 ) -> VecEnv:
-    """The sensors as SB3's agents see them: frames stacked (with zeros after a reset), channels first."""
+    """The observations of SB3's agents: stacked frames (zeros after a reset), channels first."""
 
     def make(seed: int) -> RandomSensors:
         return RandomSensors(channels, image_size, episode_length, seed)
@@ -62,7 +62,7 @@ def make_env(
 
 
 def transitions(env: VecEnv, steps: int, seed: int = 0) -> Iterator[tuple[Any, ...]]:
-    """The arguments of ``ReplayBuffer.add`` for each of ``steps`` random actions, as SB3's agents give them."""
+    """Arguments of ``ReplayBuffer.add``, as SB3's agents pass them, for ``steps`` random actions."""
     rng = np.random.default_rng(seed)
     observations = env.reset()
     assert isinstance(observations, dict)
@@ -70,7 +70,7 @@ def transitions(env: VecEnv, steps: int, seed: int = 0) -> Iterator[tuple[Any, .
         actions = rng.uniform(-1, 1, (env.num_envs, 2)).astype(np.float32)
         next_observations, rewards, dones, infos = env.step(actions)
         assert isinstance(next_observations, dict)
-        last = copy.deepcopy(next_observations)  # keeps the strides of the transposed view, as SB3's own does
+        last = copy.deepcopy(next_observations)  # keeps the strides of the transposed view, as SB3 does
         for index in np.flatnonzero(dones):
             for key, value in infos[index]["terminal_observation"].items():
                 last[key][index] = value

@@ -52,7 +52,7 @@ def constant(throttle: float, steering: float) -> Policy:
 
 def rule(batch: DriveBatch) -> Floats:
     """Holds the speed to hold and the middle of the road, and goes round the obstacle on the side with more room."""
-    throttle = (batch.speed_to_hold(batch.s + DT * batch.speed) - batch.speed) / (DT * ALONG)
+    throttle = (batch.target_speed(batch.s + DT * batch.speed) - batch.speed) / (DT * ALONG)
     distance, offset, _ = batch.obstacle_position()
     obstacle = batch.y + offset
     is_near = (AHEAD[0] < distance) & (distance < AHEAD[1])

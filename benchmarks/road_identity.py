@@ -1,17 +1,17 @@
-"""The traffic of HighwayVision-v0 against highway-env's own, side by side: the same to the last bit, in less time?
+"""
+Compare the traffic of HighwayVision-v0 with that of highway-env: is it the same to the last bit, and how much faster?
 
     OMP_NUM_THREADS=1 python -m benchmarks.road_identity
 
-Both envs get the same seeds and random actions and render nothing; one has this package's road, lanes and drivers, the
-other ``Road``, ``RoadNetwork`` and ``IDMVehicle``. After every control step all that moves a vehicle is compared: the
-script fails on the first difference. Two kinds of traffic:
+Both environments get the same seeds and random actions and render nothing. One has the road, lanes and drivers of this
+package, the other ``Road``, ``RoadNetwork`` and ``IDMVehicle``. The complete state of all vehicles is compared after
+every control step, and the script fails at the first difference. There are two kinds of traffic:
 
-- ``episodes``: as an agent meets it; a crash or leaving the road ends the episode;
-- ``breakdowns``: 100 steps on end whatever happens; every second a car, at random, stands still right ahead of another.
+- ``episodes``: as for an agent; a crash or leaving the road ends the episode;
+- ``breakdowns``: 100 steps without end; every second a random car breaks down right in front of another.
 
-Writes benchmarks/results/road_identity.csv, a row per kind and seed: ``recycled`` cars and ``lane_changes``,
-``crashed`` (cars in collisions), the number of ``values`` compared, processor time per control step of both and their
-ratio.
+Writes benchmarks/results/road_identity.csv with a row per kind and seed: ``recycled`` cars, ``lane_changes``,
+``crashed`` cars, the number of ``values`` compared, and the processor time per control step of both with their ratio.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ KINDS = ("episodes", "breakdowns")
 
 
 class NoObservation(ObservationType):  # type: ignore[misc]  # highway-env is untyped
-    """Nothing."""
+    """No observation."""
 
     def space(self) -> spaces.Box:
         return spaces.Box(0, 1, (1,), np.float32)
@@ -48,9 +48,10 @@ class NoObservation(ObservationType):  # type: ignore[misc]  # highway-env is un
 
 
 class BlindEnv(HighwayVisionEnv):
-    """HighwayVision-v0 without its sensors.
+    """
+    HighwayVision-v0 without sensors.
 
-    :param endless: whether it goes on after a crash and off the road
+    :param endless: Whether to continue after a crash and off the road.
     """
 
     def __init__(self, endless: bool = False, **kwargs: Any) -> None:
@@ -67,7 +68,7 @@ class BlindEnv(HighwayVisionEnv):
 
 
 class StockEnv(BlindEnv):
-    """The same on highway-env's own road, with its own drivers."""
+    """The same with highway-env's own road and drivers."""
 
     def _reset(self) -> None:
         def network(lanes_count: int) -> RoadNetwork:
@@ -85,7 +86,7 @@ class StockEnv(BlindEnv):
 
 
 def state(env: HighwayVisionEnv) -> list[Any]:
-    """Everything that the vehicles' motion depends on, bit by bit."""
+    """Return the complete state of all vehicles."""
     values: list[Any] = []
     for v in env.road.vehicles:
         values += [*v.position.tolist(), float(v.heading), float(v.speed), v.crashed, v.lane_index]
@@ -95,13 +96,13 @@ def state(env: HighwayVisionEnv) -> list[Any]:
 
 
 def break_down(vehicle: Vehicle, other: Vehicle) -> None:
-    """Put a vehicle three metres ahead of another, where it stands still."""
+    """Stop a vehicle three metres in front of another."""
     vehicle.position = other.position + np.array([3.0 + vehicle.LENGTH, 0.0])
     vehicle.speed, vehicle.crashed = 0.0, True
 
 
 def timed_step(env: HighwayVisionEnv, action: np.ndarray) -> tuple[float, list[Any]]:
-    """One control step: processor time in seconds, and what it returned."""
+    """Take a control step and return its processor time in seconds and its results."""
     start = time.process_time()
     _, *returned = env.step(action)
     return time.process_time() - start, returned
@@ -109,12 +110,14 @@ def timed_step(env: HighwayVisionEnv, action: np.ndarray) -> tuple[float, list[A
 
 def compare(kind: str, seed: int, steps: int, **kwargs: Any) -> dict[str, Any]:
     """
-    Drive both envs at random with one seed.
+    Drive both environments at random with one seed.
 
-    :param kind: one of :data:`KINDS`
-    :param kwargs: of both envs
-    :return: a row of the table
-    :raises AssertionError: where they differ
+    :param kind: One of :data:`KINDS`.
+    :param seed: Seed of the environments and actions.
+    :param steps: Number of control steps.
+    :param kwargs: Options of both environments.
+    :return: Row of the table.
+    :raises AssertionError: If they differ.
     """
     endless = kind == "breakdowns"
     kwargs = {"endless": endless, "max_episode_steps": 100 if endless else None, "initial_speed": 20.0, **kwargs}

@@ -1,4 +1,4 @@
-"""HighwayVision-v0 with highway-env's own driver at the wheel, for what needs a car that gets somewhere."""
+"""HighwayVision-v0 driven by highway-env's IDM/MOBIL driver."""
 
 from highway_env.vehicle.behavior import IDMVehicle
 
@@ -6,7 +6,7 @@ from sb3_have.envs import HighwayVisionEnv
 
 
 class RuleDrivenEnv(HighwayVisionEnv):
-    """An IDM/MOBIL driver at the wheel, whatever the action."""
+    """HighwayVision-v0 driven by IDM/MOBIL; actions are ignored."""
 
     def _reset(self) -> None:
         super()._reset()

@@ -1,8 +1,9 @@
-"""Draws the README's pictures: what the three sensors of HighwayVision-v0 see, in three weathers and on other roads.
+"""
+Draw the pictures of the README: the three sensors of HighwayVision-v0 in three weathers and on other roads.
 
     python -m benchmarks.sensor_picture                   # docs/sensors.png, docs/scenarios.png
 
-On the highway the ego keeps straight; on the other roads highway-env's IDM/MOBIL driver is at the wheel.
+On the highway the ego vehicle keeps straight; on the other roads highway-env's IDM/MOBIL driver drives.
 """
 
 import argparse
@@ -17,7 +18,7 @@ from sb3_have.envs import HighwayVisionEnv
 
 
 class Shot(NamedTuple):
-    """A row of a picture: RGB | event | depth after some seconds."""
+    """A row of a picture: RGB, events and depth after ``steps`` control steps."""
 
     weather: str
     scenario: str = "highway"
@@ -36,7 +37,7 @@ PICTURES = {
 
 
 def picture(shot: Shot) -> np.ndarray:
-    """The same traffic in every weather."""
+    """Render a shot. The traffic is the same in every weather."""
     env_class = HighwayVisionEnv if shot.scenario == "highway" else RuleDrivenEnv
     env: Any = env_class(shot.weather, image_size=128, render_mode="rgb_array", scenario=shot.scenario)
     _, info = env.reset(seed=shot.seed)

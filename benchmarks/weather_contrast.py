@@ -1,18 +1,19 @@
-"""What each sensor of HighwayVision-v0 still sees of other vehicles in each of the eight weathers.
+"""
+Measure how well the sensors of HighwayVision-v0 see other vehicles in each of the eight weathers.
 
     python -m benchmarks.weather_contrast
 
-The same traffic passes in every weather. Vehicles farther than 35 m, beyond the headlights, are compared with the road
-around them. Prints a table and writes benchmarks/results/weather_contrast.csv, with these columns:
+The traffic is the same in every weather. Vehicles farther away than 35 m, beyond the headlights, are compared with the
+road around them. Prints a table and writes benchmarks/results/weather_contrast.csv with the columns
 
 - ``rgb_contrast``: |mean brightness of a vehicle's pixels - mean of a ring of 2 pixels around it|, 8-bit steps;
-- ``rgb_vs_noon``: the same over that of the noon with the same sky;
-- ``events_per_pixel``: sum of |count| over the bins in a vehicle's pixels, per pixel and control step, less the noise;
-- ``events_vs_noon``: the same over that of the noon with the same sky;
+- ``rgb_vs_noon``: its ratio to the noon with the same sky;
+- ``events_per_pixel``: sum of |count| over the bins in a vehicle's pixels, per pixel and control step, minus the noise;
+- ``events_vs_noon``: its ratio to the noon with the same sky;
 - ``event_noise``: the same quantity over all pixels while nothing moves;
 - ``rgb_noise``: standard deviation over time of the colour image while nothing moves, 8-bit steps;
 - ``saturated``: share of colour pixels with a channel at 255;
-- ``recognised``: share of frames whose weather a nearest-centroid classifier names right from simple image statistics
+- ``recognised``: share of frames whose weather a nearest-centroid classifier recognises from simple image statistics
   (means and deviations of colours and events above and below the horizon), learned from other episodes;
 - ``recognised_rgb``: the same from the colour image alone.
 """

@@ -71,7 +71,7 @@ def pixel_events(
         level = filtered + positive * leak_rate * (times[i] - times[0])
 
         events: list[Event] = []
-        if level != level_before:  # a line without a slope meets nothing, whatever the last bit of the reference says
+        if level != level_before:  # a constant level crosses nothing, whatever the rounding of the reference
             polarity, threshold = (1, positive) if level > reference else (-1, negative)
             shares = crossings(reference, level_before, level, threshold, polarity)
             events = [(times[i - 1] + share * duration, polarity) for share in shares]

@@ -1,4 +1,4 @@
-"""An environment of random images and vectors, and what is needed to look at failures of its sensors."""
+"""An environment of random images and vectors, and helpers for failures of its sensors."""
 
 import copy
 from typing import Any

@@ -215,3 +215,11 @@ def test_every_paint_stands_out_from_the_road_by_its_brightness() -> None:
     # A vertical face gets about half the light of the road; an event camera needs a contrast of its threshold, 0.2.
     contrast = np.log(0.55 * (PAINTS @ LUMA) / (ASPHALT @ LUMA))
     assert np.abs(contrast).min() > 0.25
+
+
+def test_the_last_instant_begins_with_its_first_pixel() -> None:
+    pixel, one = np.array([3, 0, 4, 5]), np.ones(4, int)
+    objects = Objects(pixel, 1.0 * pixel, one, 0 * one, np.zeros((1, 2)), np.zeros(1, int))
+    last = objects.last(2, 4)
+    np.testing.assert_array_equal(np.sort(last.pixel), [0, 1])
+    np.testing.assert_array_equal(last.depth, last.pixel + 4)

@@ -32,7 +32,7 @@ import sb3_have.plotting
 import sb3_have.sensors
 from sb3_have import HAVESAC, MultiModalPolicy
 from sb3_have.configuration import env_wrapper
-from sb3_have.sensors import EVENT_DTYPE, write_events
+from sb3_have.sensors import EVENT_DTYPE
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -99,11 +99,13 @@ def small_budget(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[No
 
 def write_recording(folder: Path) -> None:
     """The recording that docs/sensors.md reads: 3 seconds of 640 x 480 pixels."""
+    from event_recordings import put  # needs h5py
+
     rng = np.random.default_rng(0)
     events = np.zeros(1000, EVENT_DTYPE)
     events["x"], events["y"] = rng.integers(640, size=1000), rng.integers(480, size=1000)
     events["t"], events["p"] = np.sort(rng.uniform(0, 3, 1000)), rng.choice([-1, 1], 1000)
-    write_events(folder / "events.h5", events, height=480, width=640)
+    put(folder / "events.h5", events)
 
 
 PREPARATIONS = {"docs/sensors.md": write_recording}

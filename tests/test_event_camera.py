@@ -13,7 +13,7 @@ from sb3_have.sensors import EVENT_DTYPE, PRESETS, EventCamera
 from sb3_have.sensors.event_camera import Mapping
 
 Event = tuple[int, int, float, int]
-#: Every part of the model at once.
+# Every part of the model at once
 EVERYTHING: dict[str, Any] = {
     "threshold": (0.15, 0.3),
     "threshold_sigma": 0.03,
@@ -35,7 +35,7 @@ def run(camera: EventCamera, frames: NDArray[Any], dt: float = 0.1) -> NDArray[A
 
 
 def loop(frames: NDArray[Any], thresholds: NDArray[Any], dt: float = 0.1) -> list[Event]:
-    """The model word by word: one pixel, one crossing at a time."""
+    """The model as a loop: one pixel and one crossing at a time."""
     _, height, width = frames.shape
     events = []
     for y in range(height):
@@ -331,8 +331,8 @@ def test_bad_frames_are_refused_and_leave_no_trace() -> None:
         np.testing.assert_array_equal(events, undisturbed.step(frame, 0.1 * k))
         for bad, t, message in (
             (frame.T, k + 1.0, r"\(6, 5\), got \(5, 6\)"),
-            (np.stack([frame] * 3, axis=-1), k + 1.0, "one grey image"),
-            (np.full((6, 5), np.nan), k + 1.0, "NaN.*nan_to_num"),
+            (np.stack([frame] * 3, axis=-1), k + 1.0, "grey image"),
+            (np.full((6, 5), np.nan), k + 1.0, "NaN"),
             (-frame, k + 1.0, ">= 0.*identity"),
             (frame, 0.1 * k, r"advance.*reset\(\)"),
             (frame, float("inf"), "advance"),

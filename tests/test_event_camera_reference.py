@@ -353,7 +353,7 @@ def test_a_pickle_goes_on_bit_by_bit(seed: int, frames: int) -> None:
 @fixed(max_examples=20)
 @given(seed=seeds, start=st.sampled_from([-100.0, 0.0, 100.0]))
 def test_reset_forgets_the_scene(seed: int, start: float) -> None:
-    """Time may begin anew; the chip, with its thresholds and leak phases, stays."""
+    """Time may start again; the chip, with its thresholds and leak phases, stays."""
     used, new = (EventCamera(4, 5, **NOISY, seed=seed) for _ in range(2))
     images, times = film(seed + 1)
     stream(used, images, times)

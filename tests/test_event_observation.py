@@ -63,7 +63,7 @@ def test_the_image_is_that_of_the_camera_used_by_hand(make: Callable[..., Env]) 
     wanted = by_hand(EventCamera(HEIGHT, WIDTH, **options), frames, 0.1)  # type: ignore[arg-type]
     same(wanted, observations)
     assert (wanted[1] > 128).any() and (wanted[1] < 128).any()
-    same(wanted, episode(env))  # the second episode starts anew
+    same(wanted, episode(env))  # a second episode is the same
 
 
 def test_mappings_see_the_numbers_they_are_made_for() -> None:
@@ -311,17 +311,16 @@ def bar(**kwargs: Any) -> Env:
     [
         (lambda: EventObservation(MovingBar()), ValueError, "got None; pass render_mode='rgb_array' to gym.make"),
         (lambda: EventObservation(MovingBar("human")), ValueError, "'human'; pass render_mode='rgb_array'"),
-        (lambda: bar(source="rgb"), KeyError, r"no key 'rgb', only \['camera', 'grey'.*name one of them"),
-        (lambda: bar(source="position"), ValueError, r"'position' must be a uint8 image.*got Box.*; make one of it"),
+        (lambda: bar(source="rgb"), KeyError, r"no key 'rgb', only \['camera', 'grey'"),
+        (lambda: bar(source="position"), ValueError, r"'position' must be a uint8 image.*got Box.*TransformObs"),
         (lambda: bar(source="lidar"), ValueError, "'lidar' must be a uint8 image"),
         (
             lambda: EventObservation(MovingBar(observation=spaces.Box(0, 255, (3, 8, 8), np.uint8)), "state"),
             ValueError,
-            "ChannelLastImages brings it into this form",
+            "convert it first with ChannelLastImages",
         ),
-        (lambda: bar(key="grey"), ValueError, "key 'grey' already"),
-        (lambda: bar(camera={"treshold": 0.3}), ValueError, r"\['treshold'\]; the options are preset, threshold,"),
-        (lambda: bar(camera={"height": 3}), ValueError, r"\['height'\]"),
+        (lambda: bar(key="grey"), ValueError, "already has the key 'grey'"),
+        (lambda: bar(camera={"treshold": 0.3}), TypeError, "treshold"),
         (lambda: bar(camera={"threshold": -1}), ValueError, "threshold must be"),
         (lambda: bar(camera="davis"), ValueError, "ideal.*got 'davis'"),
         (lambda: bar(camera=EventCamera(4, 6)), ValueError, r"4 x 6 pixels, the image 36 x 40; pass image_size=\(4, 6"),
@@ -334,12 +333,9 @@ def bar(**kwargs: Any) -> Env:
         (lambda: bar(dt=0.0), ValueError, "dt must be.*got 0.0"),
         (lambda: bar(dt=np.nan), ValueError, "dt must be.*nan"),
         (lambda: EventObservation(Timeless("rgb_array")), ValueError, r"render_fps.*pass dt=<seconds>"),
-        (lambda: bar(source=lambda env: None), ValueError, "must return a frame or a list of them, got None"),
-        (lambda: bar(source=lambda env: []), ValueError, r"list of them, got \[\]"),
+        (lambda: bar(source=lambda env: None), ValueError, "must return a frame or a list of frames, got None"),
+        (lambda: bar(source=lambda env: []), ValueError, r"list of frames, got \[\]"),
         (lambda: bar(source=lambda env: [1.5]), ValueError, "a frame must be uint8.*got float"),
-        (lambda: bar(source=7), ValueError, r"source must be 'render', a key or function\(env\), got 7"),
-        (lambda: bar(key=5), ValueError, "key must be a string, got 5"),
-        (lambda: bar(camera=5), ValueError, "camera must be None.*got 5"),
         (lambda: bar(dt="0.1"), ValueError, "dt must be.*got '0.1'"),
     ],
 )

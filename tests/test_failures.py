@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from sb3_have.sensors import FAILURES, SENSORS, decode_events, failures_for
 from sb3_have.sensors import failures as f
-from sb3_have.sensors.failures import UNSIGNED
 
 Array = NDArray[Any]
 PAIRS = [(kind, sensor) for sensor in SENSORS for kind in failures_for(sensor)]
@@ -145,7 +144,7 @@ def test_unsigned_spurious_events_have_their_rate_too() -> None:
     for kind, rates in (("noise", (0.05, 0.2, 0.8)), ("event_storm", (1.0, 4.0, 16.0))):
         failure = FAILURES[kind]["event"]
         for severity, rate in enumerate(rates, 1):
-            parameters = {**failure.at(severity), **UNSIGNED[kind]}
+            parameters = failure.at(severity, signed=False)
             counts = decode_events(failure.function(image, np.random.default_rng(severity), **parameters))
             assert counts.min() >= 0
             np.testing.assert_allclose(counts.mean(axis=(0, 1)), rate, rtol=0.1)
@@ -264,6 +263,7 @@ def test_the_table_is_complete() -> None:
             triples = [value for value in failure.parameters.values() if isinstance(value, tuple)]
             assert len(triples) == 1 and len(set(triples[0])) == 3, kind
             assert [failure.at(severity).keys() == failure.parameters.keys() for severity in (1, 2, 3)] == [True] * 3
+            assert failure.unsigned.keys() <= {*failure.parameters, "signed"}
     assert "event_storm" in failures_for("event") and "event_storm" not in failures_for("rgb")
     assert "motion_blur" not in failures_for("event") and "depth_dropout" in failures_for("depth")
     assert failures_for("vector") == ("black", "frozen", "noise", "lag", "dead_pixels")

@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 from benchmarks.road_identity import BlindEnv
 from sb3_have.envs import HighwayVisionEnv, traffic
 from sb3_have.envs.road import LANE_WIDTH
+from sb3_have.envs.vision import VisionSensors
 from sb3_have.envs.weather import WEATHERS
 
 MODALITIES = ("rgb", "event", "depth")
@@ -90,7 +91,10 @@ def test_info_keys_at_reset_and_every_step() -> None:
         ({"modalities": ("rgb", "lidar")}, "lidar"),
         ({"modalities": ()}, "modalit"),
         ({"image_size": 0}, "image_size"),
-        ({"simulation_frequency": 20, "policy_frequency": 3}, "multiple"),
+        ({"duration": 0.0}, "duration"),
+        ({"config": {"vehicle_count": 3}}, r"\['vehicle_count'\] cannot be configured.*vehicles_count"),
+        ({"config": {"screen_width": 100}}, r"\['screen_width'\]"),
+        ({"config": {"image_size": 0}}, "image_size"),
         ({"policy_frequency": 0}, "policy_frequency"),
         ({"initial_speed": 31}, "initial_speed"),
         ({"initial_speed": float("nan")}, "initial_speed"),
@@ -124,6 +128,33 @@ def test_bad_reset_options_and_actions_are_refused() -> None:
     for action in ([0.0], [np.nan, 0.0]):
         with pytest.raises(ValueError, match="action"):
             env.step(np.array(action))
+
+
+def test_configuration_takes_effect_at_the_next_reset_after_the_same_checks() -> None:
+    env = BlindEnv(initial_speed=30.0, vehicles_count=3, config={"lanes_count": 3})
+    env.reset(seed=0)
+    assert (len(env.road.vehicles), env.lanes_count) == (4, 3)
+    # 20 Hz is no multiple of 15 Hz: two sub-steps of 1/30 s
+    config = env.config
+    config["policy_frequency"] = 15
+    env.configure({"vehicles_count": 0, "duration": 0.2, "scenario": "curves", "lanes_count": 2})
+    for _ in range(2):
+        info = env.step(STRAIGHT)[4]
+    assert info["distance"] == pytest.approx(2 * 30 / 5) and info["end_reason"] is None
+    env.reset(seed=0)
+    assert len(env.road.vehicles) == 1 and env.shape.oncoming == 1 and env.sub_steps == 2
+    assert isinstance(env.sensors, VisionSensors) and env.sensors.camera.shape == env.shape
+    ends = [env.step(STRAIGHT) for _ in range(3)]
+    assert [end[4]["end_reason"] for end in ends] == [None, None, "timeout"]
+    assert ends[0][4]["distance"] == pytest.approx(30 / 15, rel=0.01) and ends[0][1] == pytest.approx(1.0, rel=0.01)
+    before = dict(config)
+    for bad in ({"vehicle_count": 1}, {"image_size": 36}, {"initial_speed": 40.0}, {"lanes_count": 3}):
+        with pytest.raises(ValueError, match=next(iter(bad))):
+            env.configure(bad)
+    assert env.config == before
+    config["crash_penalty"] = -1.0
+    with pytest.raises(ValueError, match="crash_penalty"):
+        env.reset()
 
 
 def test_step_after_the_end_warns() -> None:

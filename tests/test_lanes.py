@@ -24,8 +24,8 @@ from sb3_have.envs.road_shape import (
 )
 
 NEW = ("merge", "curves")
+# Position at which a ramp begins [m]
 RAMP_START = 4 * PERIOD
-"""Where a ramp begins [m]."""
 
 
 # ---- the shape of the road ----

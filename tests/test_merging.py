@@ -12,8 +12,8 @@ from sb3_have.envs.merging import MergingDriver
 from sb3_have.envs.road_shape import PERIOD, RAMP_JOINS, RAMP_TAPERS
 
 STRAIGHT = np.zeros(2)
+# Position at which a ramp begins [m]
 RAMP_START = 4 * PERIOD
-"""Where a ramp begins [m]."""
 
 
 def place(env: Any, x: float, y: float, heading: float = 0.0) -> None:
@@ -114,7 +114,7 @@ def test_a_ramp_that_begins_ahead_calls_for_cars_from_behind(u: float, called: b
 
 
 def overtakings(scenario: str, u: float) -> tuple[int, float]:
-    """By whom a car that stands on the left-most lane is overtaken in a minute, and how many cars are in sight."""
+    """Vehicles that overtake a car standing on the leftmost lane within a minute, and the number of cars in sight."""
     env = BlindEnv(scenario=scenario, vehicles_count=0, max_episode_steps=None)
     env.reset(seed=0)
     place(env, RAMP_START + u, 0.0)

@@ -197,6 +197,10 @@ def test_depth_round_trip(encoding: DepthEncoding, tolerance: float) -> None:
     assert error.max() < tolerance
 
 
+def test_clipped_depth_begins_at_the_camera() -> None:
+    np.testing.assert_allclose(decode_depth(encode_depth([0.4], "clipped"), "clipped"), 0.4, atol=0.2)
+
+
 def test_inverse_depth_is_fine_near_by() -> None:
     metres = np.array([1.0, 2.0, 5.0, 10.0, 100.0], dtype=np.float32)
     decoded = decode_depth(encode_depth(metres, "inverse"), "inverse")

@@ -65,7 +65,7 @@ def test_lines_of_the_curves_lie_on_the_borders_of_the_lanes(x: float) -> None:
     ego = on_lane(network.get_lane((*FORWARD, 0)), x)
     ground = camera.ground(np.array([[ego]]))
     checked = 0
-    # The right edge, the double line in the middle, the left edge, which is the right one of who comes along there.
+    # The right edge, the double line in the middle and the left edge, which is the right edge of oncoming traffic
     for index, lateral, lines in [((*FORWARD, 1), 2.0, 1), ((*FORWARD, 0), -2.0, 2), ((*ONCOMING, 1), 2.0, 1)]:
         lane = network.get_lane(index)
         for row in range(4, len(camera.ground_forward), 4):

@@ -24,8 +24,8 @@ from sb3_have.envs.weather import WEATHERS
 Array = NDArray[Any]
 NEW = ("merge", "curves")
 STRAIGHT = np.zeros(2)
+# Position at which a ramp begins [m]
 RAMP_START = 4 * PERIOD
-"""Where a ramp begins [m]."""
 
 
 class RuleDrivenEnv(BlindEnv):
@@ -109,7 +109,7 @@ def test_oncoming_traffic_is_met_head_on_and_brakes_but_does_not_reverse() -> No
     for _ in range(100):
         info = env.step(STRAIGHT)[4]
         assert info["end_reason"] is None and car.speed >= 0
-    # It waits for who blocks its lane.
+    # It waits for the car that blocks its lane
     assert car.speed < 0.1 and 5 < car.position[0] - ego.position[0] < 20
     ego.speed = 10.0
     for _ in range(15):
@@ -281,8 +281,8 @@ def test_other_numbers_of_lanes(scenario: str, lanes: int) -> None:
     [
         ({"scenario": "city"}, "highway, merge, curves; got 'city'"),
         ({"scenario": None}, "highway, merge, curves"),
-        ({"scenario": "curves", "lanes_count": 3}, "even.*got 3, choose 2 or 4"),
-        ({"scenario": "curves", "lanes_count": 1}, "even.*got 1, choose 2$"),
+        ({"scenario": "curves", "lanes_count": 3}, "even.*got 3"),
+        ({"scenario": "curves", "lanes_count": 1}, "even.*got 1"),
         ({"scenario": "curves", "simulation_frequency": 2, "policy_frequency": 1}, "simulation_frequency.*>= 3.*got 2"),
         ({"scenario": "merge", "lanes_count": 0}, "lanes_count"),
     ],

@@ -146,45 +146,35 @@ ODD = spaces.Dict(
         (SPACE, (None, "black"), {}, r"modality must be a key"),
         (image(3), ("rgb", "black"), {}, r"modality=None.*'rgb'.*DictObservation"),
         (spaces.Discrete(3), (None, "black"), {}, r"Dict or Box.*Discrete"),
-        (SPACE, ("rgb", "blck"), {}, r"'blck'.*'rgb'.*black, frozen"),
-        (SPACE, ("rgb", "event_storm"), {}, r"'event_storm'.*'rgb'.*motion_blur.*sensor="),
-        (SPACE, ("event", "overexposure"), {}, r"'overexposure'.*'event'.*event_storm"),
-        (SPACE, ("state", "misalignment"), {}, r"'misalignment'.*'vector'.*dead_pixels"),
+        (SPACE, ("rgb", "blck"), {}, r"'black', 'frozen'.*'rgb', got 'blck'"),
+        (SPACE, ("rgb", "event_storm"), {}, r"motion_blur.*'rgb', got 'event_storm'.*sensor="),
+        (SPACE, ("event", "overexposure"), {}, r"event_storm.*'event', got 'overexposure'"),
+        (SPACE, ("state", "misalignment"), {}, r"dead_pixels.*'vector', got 'misalignment'"),
         (SPACE, ("rgb", "black"), {"sensor": "lidar"}, r"sensor must be one of.*'lidar'"),
         (SPACE, ("rgb", "black"), {"sensor": "vector"}, r"'rgb'.*'vector'.*uint8"),
         (SPACE, ("state", "black"), {"sensor": "depth"}, r"'state'.*'depth'.*float32"),
         (ODD, ("float", "black"), {}, r"'float'.*uint8 \(H, W, C\).*float32 \(20, 20, 3\) in 0.0..1.0"),
         (ODD, ("first", "black"), {}, r"'first'.*\(3, 20, 20\).*ChannelLastImages"),
-        (ODD, ("stack", "black"), {}, r"'stack'.*stack frames.*outside"),
+        (ODD, ("stack", "black"), {}, r"'stack'.*stack frames outside"),
         (ODD, ("grey", "black"), {}, r"'grey'.*\(20, 20\)"),
         (ODD, ("dim", "black"), {}, r"'dim'.*0..100"),
         (ODD, ("ints", "black"), {}, r"'ints'.*float vector.*uint8 \(6,\)"),
-        (ODD, ("n", "black"), {}, r"'n' must be a Box.*Discrete"),
-        (SPACE, (["rgb"], "black"), {}, r"modality must be a string or None, got \['rgb'\]"),
-        (SPACE, ("rgb", "black"), {"name": 3}, r"name must be a string or None, got 3"),
+        (ODD, ("n", "black"), {}, r"whose modality is a Box, got Discrete"),
         (SPACE, ("rgb", "black"), {"severity": 4}, r"severity.*4"),
         (SPACE, ("rgb", "black"), {"severity": 0}, r"severity.*0"),
         (SPACE, ("rgb", "black"), {"probability": 0.5, "schedule": (0, 2)}, r"either probability or schedule"),
         (SPACE, ("rgb", "black"), {"probability": 1.5}, r"0\.\.1.*1\.5"),
         (SPACE, ("rgb", "black"), {"probability": float("nan")}, r"0\.\.1.*nan"),
-        (SPACE, ("rgb", "black"), {"probability": "0.5"}, r"number in 0\.\.1.*'0\.5'"),
-        (SPACE, ("rgb", "black"), {"probability": True}, r"number in 0\.\.1.*True"),
-        (SPACE, ("rgb", "black"), {"severity": True}, r"severity.*True"),
         (SPACE, ("rgb", "black"), {"severity": "2"}, r"severity.*'2'"),
-        (SPACE, ("rgb", "black"), {"seed": None}, r"seed must be an integer >= 0, got None"),
-        (SPACE, ("rgb", "black"), {"seed": -1}, r"seed.*-1"),
-        (SPACE, ("rgb", "black"), {"seed": 1.5}, r"seed.*1\.5"),
-        (SPACE, ("rgb", "black"), {"signed": False}, r"signed.*'event', got False for 'rgb'"),
-        (SPACE, ("event", "black"), {"signed": 0}, r"signed.*got 0 for 'event'"),
-        (SPACE, ("rgb", "black"), {"probability": 0.1, "duration": "4"}, r"1 steps or more.*'4'"),
+        (SPACE, ("rgb", "black"), {"signed": False}, r"signed=False.*'event', got 'rgb'"),
         (SPACE, ("rgb", "black"), {"schedule": (False, 5)}, r"steps.*False"),
         (SPACE, ("rgb", "black"), {"probability": 0.5, "per": "day"}, r"per must be.*'day'"),
         (SPACE, ("rgb", "black"), {"per": "episode"}, r"per='episode'.*without a probability"),
         (SPACE, ("rgb", "black"), {"duration": 5, "schedule": (1, 2)}, r"duration=5.*without a probability"),
         (SPACE, ("rgb", "black"), {"probability": 0.5, "per": "episode", "duration": 5}, r"duration=5.*no effect"),
-        (SPACE, ("rgb", "black"), {"probability": 1.0, "duration": 5}, r"probability of 1"),
-        (SPACE, ("rgb", "black"), {"probability": 0.1, "duration": 0.5}, r"1 steps or more.*0\.5"),
-        (SPACE, ("rgb", "black"), {"probability": 0.8, "duration": 2}, r"0\.8.*4 steps or more.*2"),
+        (SPACE, ("rgb", "black"), {"probability": 1.0, "duration": 5}, r"duration=5 has no effect.*whole episode"),
+        (SPACE, ("rgb", "black"), {"probability": 0.1, "duration": 0.5}, r"at least 1 steps.*0\.5"),
+        (SPACE, ("rgb", "black"), {"probability": 0.8, "duration": 2}, r"0\.8.*at least 4 steps.*2"),
         (SPACE, ("rgb", "black"), {"schedule": (5, 5)}, r"start < stop.*\(5, 5\)"),
         (SPACE, ("rgb", "black"), {"schedule": (-1, 5)}, r"0 <= start.*\(-1, 5\)"),
         (SPACE, ("rgb", "black"), {"schedule": (0.5, 5)}, r"steps.*0\.5"),
@@ -196,12 +186,3 @@ ODD = spaces.Dict(
 def test_bad_input_is_named(space: Any, args: tuple[Any, ...], kwargs: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         SensorFailure(Scenes(space), *args, **kwargs)
-
-
-def test_an_observation_that_is_no_array_is_named() -> None:
-    class Lists(Scenes):
-        def observe(self) -> Any:
-            return {**super().observe(), "state": [0.0] * 6}
-
-    with pytest.raises(ValueError, match=r"'state' should be an array.*got list; return np.array"):
-        SensorFailure(Lists(), "state", "black").reset(seed=0)

@@ -1,4 +1,9 @@
-"""Environments; importing this package registers them: HighwayVision-v0, CarlaVision-v0 and ReliabilityDrive-v0."""
+"""
+Driving environments, registered on import: HighwayVision-v0, CarlaVision-v0 and ReliabilityDrive-v0.
+
+What belongs here simulates or connects to a world, and drives in it by rule; nothing here imports torch. Sensors that
+work with any environment belong to :mod:`sb3_have.sensors`.
+"""
 
 from typing import TYPE_CHECKING, Any
 
@@ -10,14 +15,14 @@ if TYPE_CHECKING:
 
 __all__ = ["HighwayVisionEnv", "ReliabilityDriveEnv"]
 
-# The entry points are given by name, so that highway-env is imported when an environment is made, and the package
-# carla, an extra, only for CarlaVision-v0
+# Entry points are strings, so that highway-env is imported with the first environment, and the optional package carla
+# only for CarlaVision-v0
 if "HighwayVision-v0" not in registry:
     register(
         id="HighwayVision-v0",
         entry_point="sb3_have.envs.highway_vision:HighwayVisionEnv",
         max_episode_steps=500,
-        kwargs={"max_episode_steps": None},  # gymnasium counts, see ReportTimeout
+        kwargs={"max_episode_steps": None},  # Gymnasium counts the steps, see ReportTimeout
         additional_wrappers=(WrapperSpec("ReportTimeout", "sb3_have.envs.highway_vision:ReportTimeout", {}),),
     )
 

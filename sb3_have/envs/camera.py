@@ -1,11 +1,13 @@
-"""A pinhole camera on the roof of a car: from poses to what every pixel sees.
+"""
+A pinhole camera on the roof of a car, which turns poses into what every pixel sees.
 
-Objects are painted face by face, far to near, with OpenCV at twice the resolution. The plane equation of the painted
-face then gives each sample its exact depth and place on the face, and the face's texture its material. The ground needs
-no painting, see :mod:`sb3_have.envs.ground`. Several instants are rendered in one pass, because at these image sizes
-the cost is numpy calls, not pixels.
+Objects are painted with OpenCV face by face, far to near, at twice the resolution. The plane equation of the painted
+face then gives the exact depth and place on the face of each sample, and the texture of the face gives its material.
+The ground is not painted, see :mod:`sb3_have.envs.ground`. Several instants are rendered in one pass, because at these
+image sizes NumPy calls dominate the cost.
 
-Camera frame: forward, right, metres. Image: u to the right, v down, in pixels; the first pixel's centre is (0.5, 0.5).
+Camera frame: forward and right, in metres. Image: u to the right, v down, in pixels; the centre of the first pixel is
+(0.5, 0.5).
 """
 
 from __future__ import annotations
@@ -38,38 +40,54 @@ from sb3_have.envs.scene import (
     vehicle_faces,
 )
 
+# Near plane and range of sight [m]
 NEAR: Final = 0.5
 FAR: Final = 200.0
-#: Samples per pixel and direction.
+# Samples per pixel and direction
 SUPERSAMPLING: Final = 2
 
 
 @dataclass
 class Objects:
-    """Samples that hit an object, (samples,) each unless said otherwise."""
+    """
+    Samples that hit an object.
 
-    pixel: NDArray[np.int64]  # flat index into (instants, height, width)
-    depth: Array  # metres along the optical axis
+    :param pixel: Flat index into (instants, height, width), (samples,).
+    :param depth: Depth along the optical axis in metres, (samples,).
+    :param material: Material, (samples,).
+    :param face: Index into ``normal`` and ``vehicle``, (samples,).
+    :param normal: Outward normals in the world frame, (faces, 2).
+    :param vehicle: Number of the traffic vehicle or -1, (faces,).
+    """
+
+    pixel: NDArray[np.int64]
+    depth: Array
     material: IntArray
-    face: IntArray  # index into the following
-    normal: Array  # (faces, 2), outward, world frame
-    vehicle: IntArray  # (faces,), number of the traffic vehicle or -1
+    face: IntArray
+    normal: Array
+    vehicle: IntArray
 
     def last(self, instants: int, pixels: int) -> Objects:
-        """The samples of the last of several instants of so many pixels each, as if it had been rendered alone."""
+        """
+        Return the samples of the last instant, as if it had been rendered alone.
+
+        :param instants: Number of instants.
+        :param pixels: Pixels per instant.
+        """
         first = (instants - 1) * pixels
-        since = int(np.searchsorted(self.pixel, first))  # the pixels of an instant are in no order, the instants are
+        # The instants are sorted, though the pixels within each are not
+        since = int(np.searchsorted(self.pixel, first))
         pixel, depth = self.pixel[since:] - first, self.depth[since:]
         return Objects(pixel, depth, self.material[since:], self.face[since:], self.normal, self.vehicle)
 
 
 class Camera:
     """
-    Pinhole camera 1 m ahead of the ego's centre and 1.5 m above the road, looking along its heading.
+    Pinhole camera 1 m ahead of the centre of the ego vehicle and 1.5 m above the road, looking along its heading.
 
-    :param image_size: Rows and columns.
-    :param shape: Of the road.
-    :param field_of_view: Horizontal and vertical angle in degrees.
+    :param image_size: Rows and columns in pixels.
+    :param shape: Shape of the road.
+    :param field_of_view: Horizontal and vertical field of view in degrees.
     """
 
     offset = 1.0
@@ -79,48 +97,48 @@ class Camera:
         self.size = image_size
         self.shape = shape
         self.roadside = Roadside(shape)
-        # Nobody sees the front of a car that goes the same way.
+        # Only the fronts of oncoming cars are visible
         self._front = FRONT_LIT if shape.oncoming else FRONT
         self.focal = float(0.5 * image_size / np.tan(np.radians(field_of_view / 2)))
         self.centre = 0.5 * image_size
-        #: First image row that looks at the ground. In an odd number of rows the middle one looks at infinity.
+        # First image row that looks at the ground; with an odd number of rows the middle one looks at infinity
         self.horizon = image_size // 2 + image_size % 2
-        #: Tangent of the angle to the axis, of every column and every row, of pixels and of samples.
+        # Tangent of the angle to the optical axis of every column (and row), of pixels and of samples
         self.slope = self._tangent(np.arange(image_size) + 0.5)
         self._sample_u = ((np.arange(SUPERSAMPLING * image_size) + 0.5) / SUPERSAMPLING).astype(np.float32)
         self._sample_slope = self._tangent(self._sample_u)
-        #: Distance of the ground in each row from the horizon down, (rows, 1), and its offset to the right.
+        # Distance of the ground in each row below the horizon [m], (rows, 1), and its offset to the right [m]
         self.ground_forward = np.float32(self.height) / self.slope[self.horizon :, None]
         self.ground_right = self.ground_forward * self.slope
         self.ground_view = GroundView(shape, self.ground_forward, self.ground_right, self.focal, self.height)
 
     def ground(self, poses: Array) -> Ground:
         """
-        What the ground looks like.
+        Render the ground.
 
-        :param poses: (instants, 1 + vehicles, 3): x, y, heading; row 0 is the ego.
+        :param poses: x [m], y [m] and heading [rad], (instants, 1 + vehicles, 3); row 0 is the ego vehicle.
         """
         x, y, heading = (value.astype(np.float32)[:, None, None] for value in self._pose(poses, WORLD_PERIOD))
         return self.ground_view.look(x, y, heading)
 
     def objects(self, poses: Array, sizes: Array) -> Objects:
         """
-        What stands on the ground.
+        Render what stands on the ground.
 
         :param poses: As in :meth:`ground`.
-        :param sizes: (1 + vehicles, 2): length and width in metres.
+        :param sizes: Length and width in metres, (1 + vehicles, 2).
         """
         faces = self._project(poses, sizes)
         side = SUPERSAMPLING * self.size
         painted = self._paint(len(poses), faces).reshape(-1)
         sample = np.flatnonzero(painted != 0)
         face = painted[sample].astype(np.int64) - 1
-        # Line: row of the images stacked. (numpy divides by a constant much faster than it takes a remainder.)
+        # Line: row of the stacked images. Dividing by a constant is much faster in NumPy than taking a remainder.
         line = sample.astype(np.int32) // side
         column = sample - side * line
         pixel = line // SUPERSAMPLING * self.size + column // SUPERSAMPLING
 
-        # Inverse depth, and s over depth, are linear along an image row.
+        # Inverse depth, and s divided by depth, are linear along an image row
         u0, per_pixel, inverse, inverse_change, s, s_change, s_max, bottom, cells = faces.plane.take(face, axis=1)
         q = np.clip((self._sample_u[column] - u0) * per_pixel, 0, 1)
         depth = 1 / (inverse + q * inverse_change)
@@ -135,8 +153,11 @@ class Camera:
 
     def depth(self, objects: Objects) -> Array:
         """
-        Depth of one instant, (height, width): metres along the optical axis to the nearest object that a sample of the
-        pixel hits, else to the ground; infinite in the sky.
+        Return the depth of one instant in metres along the optical axis, (height, width).
+
+        It is that of the nearest object that a sample of the pixel hits, else that of the ground; infinite in the sky.
+
+        :param objects: Objects of one instant.
         """
         depth = np.full((self.size, self.size), np.inf, dtype=np.float32)
         depth[self.horizon :] = self.ground_forward
@@ -148,13 +169,13 @@ class Camera:
         return ((pixels - self.centre) / self.focal).astype(np.float32)
 
     def _pose(self, poses: Array, period: float = np.inf) -> tuple[Array, Array, Array]:
-        """Position x (modulo a period), y and heading of the camera, (instants,) each."""
+        """Position x (modulo a period) and y [m] and heading [rad] of the camera, (instants,) each."""
         x, y, heading = poses[:, 0].T
         x = x + self.offset * np.cos(heading)
         return x if period == np.inf else x % period, y + self.offset * np.sin(heading), heading
 
     def _project(self, poses: Array, sizes: Array) -> _Projected:
-        """The faces that the camera sees, far to near in each instant."""
+        """Faces that the camera sees, far to near at each instant."""
         x, y, heading = self._pose(poses)
         traffic = poses[:, 1:]
         forward, right = _to_camera(traffic[..., :2], x, y, heading)
@@ -164,12 +185,12 @@ class Camera:
         order = shown[np.argsort(-distance[:, shown], axis=1, kind="stable")]
         faces = Faces.concatenate(*self.roadside.faces(x, FAR), vehicle_faces(traffic, sizes[1:], order, self._front))
 
-        # Both ends of the faces in the camera frame: (start and end, instants, faces).
+        # Both ends of the faces in the camera frame, (start and end, instants, faces)
         forward, right = _to_camera(np.stack((faces.start, faces.end)), x, y, heading)
-        # Turned towards the camera: the start lies to the left of the end.
+        # Faces that are turned towards the camera have their start to the left of their end
         seen = forward[0] * right[1] > right[0] * forward[1]
         seen &= np.maximum(forward[0], forward[1]) > 2 * NEAR
-        # A vehicle is shown at the instants at which it is in view, the roadside at all.
+        # Show vehicles at the instants at which they are in view, and the roadside always
         every = np.arange(len(poses))[:, None]
         seen[:, seen.shape[1] - 4 * len(shown) :] &= in_view[every, order].repeat(4, axis=1)
         face = np.flatnonzero(seen)
@@ -193,7 +214,7 @@ class Camera:
         corners[:, 2, 0], corners[:, 3, 0] = u[1] - tip, u[0] + tip
         corners[:, :2, 1] = (self.centre + self.focal * (self.height - bottom) * inverse).T
         corners[:, 3:1:-1, 1] = (self.centre + self.focal * (self.height - top) * inverse).T
-        # Just under the end of the texture, so that a sample on a face's edge falls into the last cell.
+        # Just below the end of the texture, so that a sample on the edge of a face falls into the last cell
         s_max = np.maximum(faces.s_start, faces.s_end) - 1e-4
         cells = TEXTURE_ROWS / (top - bottom)
         per_pixel = 1 / np.maximum(width, 1e-6)
@@ -205,16 +226,16 @@ class Camera:
 
     def _remoteness(self, faces: Faces, face: IntArray, ends: Array, middles: Array, y: Array) -> Array:
         """
-        The order of faces on a road that bends or forks, which has its roadside before vehicles as well as behind them.
+        Distances by which to sort the faces of a road that bends or forks, where the roadside may hide vehicles.
 
         :param faces: All faces.
-        :param face: Those to sort, indices into the flattened arrays.
-        :param ends: Distance of both ends of all faces, (2, instants, faces).
-        :param middles: Distance of the vehicles' middles, (instants, vehicles).
-        :param y: The same of their places.
-        :return: Metres; what stands behind rails counts as farther away than it is.
+        :param face: Faces to sort, as indices into the flattened arrays.
+        :param ends: Distance of both ends of all faces in metres, (2, instants, faces).
+        :param middles: Distance of the centres of the vehicles in metres, (instants, vehicles).
+        :param y: Position y of the vehicles in metres, (instants, vehicles).
+        :return: Metres. Faces behind rails count as farther away than they are.
         """
-        # A piece of rail counts by its farther end: all that stands behind rails is still farther.
+        # A piece of rail counts by its farther end, and what stands behind it is farther still
         far = np.maximum(ends[0], ends[1]).take(face)
         place = 0.5 * (faces.start[..., 1].take(face) + faces.end[..., 1].take(face))
         vehicle = faces.vehicle.take(face)
@@ -225,11 +246,11 @@ class Camera:
         return np.asarray(far)
 
     def _paint(self, instants: int, faces: _Projected) -> NDArray[np.int32]:
-        """Number of the face (from 1) that each sample sees, (instants, rows, columns) of samples; 0 for none."""
+        """Number (from 1) of the face that each sample sees, or 0, (instants, sample rows, sample columns)."""
         side = SUPERSAMPLING * self.size
         canvas = np.zeros((instants, side, side), dtype=np.int32)
         corners = faces.corners * SUPERSAMPLING - 0.5
-        # OpenCV paints the outline too, half a sample on each side; a face always keeps one sample.
+        # OpenCV also paints the outline, half a sample on each side. A face always keeps one sample.
         corners -= np.clip(corners - corners.mean(axis=1, keepdims=True), -0.5, 0.5)
         polygons = np.rint(corners * 16).astype(np.int32)
         for number, (instant, polygon) in enumerate(zip(faces.instant.tolist(), polygons, strict=True), start=1):
@@ -239,11 +260,20 @@ class Camera:
 
 @dataclass
 class _Projected:
-    """Faces in the image, (faces, ...) each."""
+    """
+    Faces in the image, (faces, ...) each unless stated otherwise.
+
+    :param instant: Instant.
+    :param corners: u, v of the bottom left, bottom right, top right and top left corner, (faces, 4, 2).
+    :param plane: u0, 1 / width, 1 / depth and its change, s / depth and its change, largest s, bottom [m] and cells per
+        metre, (9, faces).
+    :param kind: Kind of face.
+    :param normal: Outward normal, (faces, 2).
+    :param vehicle: Number of the traffic vehicle or -1.
+    """
 
     instant: IntArray
-    corners: Array  # (faces, 4, 2): u, v of bottom left, bottom right, top right, top left
-    #: (9, faces): u0, 1 / width, 1 / depth, its change, s / depth, its change, largest s, bottom, cells / m
+    corners: Array
     plane: NDArray[np.float32]
     kind: IntArray
     normal: Array
@@ -251,7 +281,7 @@ class _Projected:
 
 
 def _to_camera(points: Array, x: Array, y: Array, heading: Array) -> tuple[Array, Array]:
-    """World points (..., instants, n, 2) in the camera frame: forward and right, (..., instants, n) each."""
+    """Forward and right [m] of world points (..., instants, n, 2) in the camera frame, (..., instants, n) each."""
     dx, dy = points[..., 0] - x[:, None], points[..., 1] - y[:, None]
     cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
     return cos * dx + sin * dy, cos * dy - sin * dx
@@ -259,10 +289,10 @@ def _to_camera(points: Array, x: Array, y: Array, heading: Array) -> tuple[Array
 
 def _clip_near(point: Array, other: Array) -> None:
     """
-    Move the points that lie behind the near plane along their face onto it.
+    Move the ends behind the near plane along their faces onto it.
 
-    :param point: Forward, right, place on the texture: (3, faces). Changed in place.
-    :param other: The other end of the faces.
+    :param point: Forward [m], right [m] and place on the texture of one end, (3, faces). Modified in place.
+    :param other: The same of the other end.
     """
     behind = np.flatnonzero(point[0] < NEAR)
     moved, towards = point[:, behind], other[:, behind] - point[:, behind]

@@ -1,10 +1,12 @@
-"""highway-env's IDM/MOBIL driver on a :class:`~sb3_have.envs.road.HighwayRoad`, bit for bit, in half the time.
+"""
+highway-env's IDM/MOBIL driver on a :class:`~sb3_have.envs.road.HighwayRoad`, bit for bit, in half the time.
 
-A driver decides with a few dozen operations on single numbers, on which numpy is slow. Here they are Python's, which
-round alike, except for the functions beyond plain arithmetic: numpy's may differ from the C library's in the last bit.
-The models: Treiber et al., "Congested traffic states in empirical observations and microscopic simulations", Physical
-Review E 62, 2000 (IDM); Kesting et al., "General lane-changing model MOBIL for car-following models", TRR 1999, 2007;
-the steering is highway-env's, a cascade of proportional controllers for lateral position and heading.
+A driver decides with a few dozen operations on single numbers, which are slow in NumPy. This module uses Python's
+arithmetic, which rounds in the same way. Other functions remain NumPy's, because those of the C library may differ in
+the last bit. The models are those of Treiber et al., "Congested traffic states in empirical observations and
+microscopic simulations", Physical Review E 62, 2000 (IDM); Kesting et al., "General lane-changing model MOBIL for
+car-following models", TRR 1999, 2007. The steering is highway-env's, a cascade of proportional controllers for lateral
+position and heading.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from highway_env.vehicle.kinematics import Vehicle
 
 
 class Driver(IDMVehicle):
-    """An ``IDMVehicle`` that knows its road to lead along x and to be longer than any drive."""
+    """An ``IDMVehicle`` for a road along x that is longer than any episode."""
 
     speed: float
     heading: float
@@ -80,7 +82,7 @@ class Driver(IDMVehicle):
         speed_ratio = max(ego_vehicle.speed, 0) / abs(not_zero(target_speed))
         acceleration = self.COMFORT_ACC_MAX * (1 - float(np.power(speed_ratio, self.DELTA)))
         if front_vehicle is not None:
-            # Of either sign: it is squared.
+            # Its sign does not matter, because it is squared
             distance = float(front_vehicle.position[0] - ego_vehicle.position[0])
             gap_ratio = self.desired_gap(ego_vehicle, front_vehicle) / not_zero(distance)
             acceleration -= self.COMFORT_ACC_MAX * float(np.power(gap_ratio, 2))
@@ -97,7 +99,7 @@ class Driver(IDMVehicle):
 
 
 class NeverReverses(Vehicle):
-    """A vehicle that brakes to a halt and no further; highway-env's own goes on backwards."""
+    """A vehicle that does not go backwards when it keeps braking, as highway-env's does."""
 
     MIN_SPEED = 0.0
     speed: float
@@ -108,7 +110,7 @@ class NeverReverses(Vehicle):
 
 
 class ScenarioDriver(NeverReverses, Driver):
-    """The driver of all roads but the straight highway: it meets cars head-on, or the end of its lane."""
+    """Driver on winding roads and roads with ramps, who may have to stop for oncoming cars or the end of a lane."""
 
 
 def _clip(value: float, low: float, high: float) -> float:

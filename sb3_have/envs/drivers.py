@@ -1,4 +1,4 @@
-"""Rule-based drivers with the ``predict`` of an SB3 model, to compare agents with."""
+"""Rule-based drivers with the ``predict`` of an SB3 model, as baselines for agents."""
 
 from __future__ import annotations
 
@@ -9,17 +9,19 @@ import numpy as np
 
 
 class RuleDriver:
-    """A driver that needs no images. Its actions are HighwayVision-v0's [throttle, steer], each in -1..1.
+    """
+    Base class of drivers that need no images. Actions are those of HighwayVision-v0, [throttle, steer] in -1..1.
 
-    The speed is in no observation, so a rule cannot read it there as a learned driver must infer it. It reads a
-    speedometer instead: :func:`~sb3_have.evaluate` shows it the ``info`` of every reset and step by
-    :meth:`read_infos`; in a loop of your own, call that before every :meth:`predict`.
+    Observations do not contain the speed, so rule-based drivers take it from ``info``: :func:`~sb3_have.evaluate`
+    passes the ``info`` of every reset and step to :meth:`read_infos`. In your own loop, call it before every
+    :meth:`predict`.
     """
 
     def read_infos(self, infos: Sequence[dict[str, Any]]) -> None:
-        """Take note of where the cars are.
+        """
+        Store what the driver needs to know.
 
-        :param infos: the latest ``info`` of each environment
+        :param infos: Latest ``info`` of each environment.
         """
 
     def _act(self, n_envs: int) -> np.ndarray:
@@ -32,13 +34,14 @@ class RuleDriver:
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
     ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Actions in the manner of SB3.
+        """
+        Return the next actions, like ``BaseAlgorithm.predict``.
 
-        :param observation: not looked at
-        :param state: handed back
-        :param episode_start: one flag per environment, shape (n,); None for a single environment
-        :param deterministic: without effect
-        :return: actions, float32 (n, 2), or (2,) without ``episode_start``; and the state
+        :param observation: Not used.
+        :param state: Returned unchanged.
+        :param episode_start: One flag per environment, (n,); None for a single environment.
+        :param deterministic: Not used.
+        :return: Actions, float32 (n, 2), or (2,) without ``episode_start``; and the state.
         """
         if episode_start is None:
             return self._act(1)[0], state
@@ -46,9 +49,10 @@ class RuleDriver:
 
 
 class RandomDriver(RuleDriver):
-    """Uniform random actions.
+    """
+    Uniform random actions.
 
-    :param seed: of its generator
+    :param seed: Seed of the random generator.
     """
 
     def __init__(self, seed: int = 0) -> None:
@@ -59,10 +63,11 @@ class RandomDriver(RuleDriver):
 
 
 class KeepStraightDriver(RuleDriver):
-    """Keeps its lane at a constant speed, blind to all traffic.
+    """
+    Keeps its lane at a constant speed and ignores all traffic.
 
-    :param target_speed: [m/s]
-    :param max_acceleration: of the car at full throttle [m/s^2]
+    :param target_speed: Speed in m/s.
+    :param max_acceleration: Acceleration of the car at full throttle in m/s^2.
     """
 
     def __init__(self, target_speed: float = 25.0, max_acceleration: float = 5.0) -> None:
@@ -78,6 +83,6 @@ class KeepStraightDriver(RuleDriver):
     def _act(self, n_envs: int) -> np.ndarray:
         if self._speeds is None or len(self._speeds) != n_envs:
             raise RuntimeError(f"call read_infos with the infos of the {n_envs} environments before every predict")
-        # the acceleration that closes the gap in one second
+        # Accelerate so as to reach the target speed in one second
         throttle = np.clip((self.target_speed - self._speeds) / self.max_acceleration, -1.0, 1.0)
         return np.stack([throttle, np.zeros(n_envs)], axis=1).astype(np.float32)

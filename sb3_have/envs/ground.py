@@ -1,7 +1,8 @@
-"""The flat ground under a camera: what share of every pixel is marking, road and verge.
+"""
+The flat ground as a camera sees it: the shares of marking, road and verge in every pixel.
 
-Nothing is painted: all shares are known in closed form, box-filtered over the pixel's footprint on the ground. Where
-the road runs at an angle to the view, the footprint's length counts as well as its width.
+All shares have a closed form, box-filtered over the footprint of the pixel on the ground. Where the road runs at an
+angle to the view, the length of the footprint matters as well as its width.
 """
 
 from __future__ import annotations
@@ -23,20 +24,26 @@ from sb3_have.envs.scene import (
     IntArray,
 )
 
-#: A pixel's footprint is taken to be no longer than this [m], less than what has a beginning and an end on any road.
+# Footprints are limited to this length [m], which is shorter than anything on a road that begins and ends
 LONGEST: Final = 200.0
 
 
 @dataclass
 class Ground:
-    """What each pixel under the horizon sees, float32 (instants, rows, columns)."""
+    """
+    The ground in each pixel below the horizon, float32 (instants, rows, columns) each.
 
-    road: Array  # share of the paved road; the rest is verge
-    marking: Array  # share of the road that is painted; the rest is asphalt
-    verge: Array  # brightness factor of the verge's patchwork
+    :param road: Share of the paved road; the rest is verge.
+    :param marking: Share of the road that is painted; the rest is asphalt.
+    :param verge: Brightness factor of the patchwork of the verge.
+    """
+
+    road: Array
+    marking: Array
+    verge: Array
 
     def last(self) -> Ground:
-        """The last instant alone."""
+        """Return the last instant."""
         return Ground(self.road[-1:], self.marking[-1:], self.verge[-1:])
 
 
@@ -44,29 +51,31 @@ class GroundView:
     """
     The ground as a camera sees it.
 
-    :param shape: Of the road.
-    :param forward: Distance of the ground in each row, float32 (rows, 1), in metres.
-    :param right: Its offset to the right in each pixel, float32 (rows, columns).
+    :param shape: Shape of the road.
+    :param forward: Distance of the ground in each row in metres, float32 (rows, 1).
+    :param right: Its offset to the right in each pixel in metres, float32 (rows, columns).
     :param focal: Focal length in pixels.
-    :param height: Of the camera in metres.
+    :param height: Height of the camera in metres.
     """
 
     def __init__(self, shape: RoadShape, forward: Array, right: Array, focal: float, height: float) -> None:
         self.shape, self.forward, self.right = shape, forward, right
         self.middle, self.half_width = np.float32(shape.middle), np.float32(shape.half_width)
-        #: Size of a pixel on the ground, (rows, 1).
+        # Width and length of a pixel on the ground [m], (rows, 1)
         self.wide = forward / np.float32(focal)
         self.long = np.minimum(self.wide * forward / np.float32(height), np.float32(LONGEST))
-        # Patches of 1 m average out where they are smaller than a pixel: the share of their contrast that is left.
+        # Remaining contrast of the patches of 1 m, which average out where they are smaller than a pixel
         self.contrast = np.minimum(1, 2 / np.maximum(self.wide, self.long))
-        # The verge is a patchwork of random brightness, the same in every episode.
+        # The verge is a patchwork of random brightness, the same in every episode
         self.patchwork = np.random.default_rng(0).uniform(0.55, 1.45, (64, 64)).astype(np.float32)
 
     def look(self, x: Array, y: Array, heading: Array) -> Ground:
         """
-        :param x: Of the camera at each instant, float32 (instants, 1, 1); the others too.
-        :param y: In metres.
-        :param heading: In radians.
+        Render the ground.
+
+        :param x: Position of the camera along the road in metres, float32 (instants, 1, 1).
+        :param y: Position of the camera across the road in metres, same shape.
+        :param heading: Heading of the camera in radians, same shape.
         """
         shape, width = self.shape, np.float32(self.shape.lane_width)
         sin, cos = np.sin(heading), np.cos(heading)
@@ -85,7 +94,7 @@ class GroundView:
             distance, beyond = distance * narrow, beyond * narrow
         marking = _line_share(distance, span)
         road = np.clip(np.float32(0.5) - beyond / span, 0, 1)
-        # Lines between lanes are dashed.
+        # Lines between lanes are dashed
         inner = (marking != 0) & (line > 0) & (line < shape.lanes_count)
         if shape.oncoming:
             self._draw_centre(marking, line, distance, span)
@@ -93,8 +102,8 @@ class GroundView:
         between = np.flatnonzero(inner)
         marking.reshape(-1)[between] *= self._dashes(along, between, DASH_PERIOD)
         if shape.ramps:
-            # As is the road's edge beside the lane that a ramp becomes.
-            since = along % PERIOD  # the footprint may also reach back to the ramp of the period before
+            # So is the edge of the road beside an acceleration lane. The footprint may reach back to the previous ramp.
+            since = along % PERIOD
             beside = np.maximum(
                 _share_between(since, self.long, RAMP_JOINS, RAMP_ENDS),
                 _share_between(since + PERIOD, self.long, RAMP_JOINS, RAMP_ENDS),
@@ -109,21 +118,21 @@ class GroundView:
         return Ground(road, marking, verge)
 
     def _dashes(self, along: Array, dashed: IntArray, period: float) -> Array:
-        """Share of these pixels' length that dashes cover."""
+        """Share of the length of these pixels that dashes cover."""
         middle = along.take(dashed)
         length = self.long[dashed // along.shape[2] % len(self.long), 0]
         paint = _painted_length(middle + length / 2, period) - _painted_length(middle - length / 2, period)
         return np.asarray(paint / length)
 
     def _draw_centre(self, marking: Array, line: Array, distance: Array, span: Array) -> None:
-        """Two solid lines side by side between the directions."""
+        """Draw two solid lines side by side between the directions."""
         centre = np.flatnonzero(line == self.shape.oncoming)
         distance, span = distance.take(centre), span.take(centre)
         both = _line_share(np.abs(distance - CENTRE_LINES), span) + _line_share(distance + CENTRE_LINES, span)
         marking.reshape(-1)[centre] = np.minimum(both, 1)
 
     def _add_ramps(self, marking: Array, road: Array, along: Array, across: Array, sin: Array, cos: Array) -> None:
-        """The ramp that began last before each pixel, and its neighbours where the footprint reaches them."""
+        """Draw the last ramp that began before each pixel, and its neighbours where the footprint reaches them."""
         since, half = along % PERIOD, self.long / 2
         self._draw_ramp(marking, road, since, across, sin, cos, slice(None))
         for shift, reaches in [(-PERIOD, since + half > PERIOD), (PERIOD, since - half < RAMP_ENDS - PERIOD)]:
@@ -135,10 +144,10 @@ class GroundView:
         self, marking: Array, road: Array, since: Array, across: Array, sin: Array, cos: Array, rows: slice
     ) -> None:
         """
-        The pavement and the two solid lines of a ramp; its left line ends where the ramp joins the road.
+        Draw the pavement and the two solid lines of a ramp; the left line ends where the ramp joins the road.
 
-        :param since: Metres since it began, negative before.
-        :param rows: Which to draw.
+        :param since: Metres since the beginning of the ramp, negative before it.
+        :param rows: Rows to draw.
         """
         marking, road, since, across = marking[:, rows], road[:, rows], since[:, rows], across[:, rows]
         wide, long = self.wide[rows], self.long[rows]
@@ -159,8 +168,9 @@ class GroundView:
 
 def _footprint(wide: Array, long: Array, slope: Array, sin: Array, cos: Array) -> tuple[Array, Array]:
     """
-    Extent of a pixel's footprint square to a line of this slope, and the factor that turns distances along y into
-    distances square to the line.
+    Return the extent of a footprint perpendicular to a line of this slope, in metres.
+
+    The second value converts distances along y into distances perpendicular to the line.
     """
     narrow = 1 / np.sqrt(1 + slope * slope)
     along, aside = (cos + sin * slope) * narrow, (sin - cos * slope) * narrow
@@ -168,19 +178,19 @@ def _footprint(wide: Array, long: Array, slope: Array, sin: Array, cos: Array) -
 
 
 def _share_between(x: Array, length: Array, first: float, last: float) -> Array:
-    """Share of a footprint of this length, its middle at x, that lies between two places farther apart than that."""
+    """Share of a footprint of this length, centred at x, between two places that are farther apart than that."""
     inside = np.minimum(x - np.float32(first), np.float32(last) - x)
     return np.asarray(np.clip(inside / length + np.float32(0.5), 0, 1))
 
 
 def _line_share(distance: Array, span: Array) -> NDArray[np.float32]:
-    """Share of a footprint of this span that lies on a line, of whose middle its own is so far."""
+    """Share of a footprint of this span that lies on a line at this distance, measured between the centres [m]."""
     share = np.maximum((LINE_WIDTH / 2 + span / 2 - distance) / span, 0)
     return np.asarray(np.minimum(share, np.minimum(1, LINE_WIDTH / span)))
 
 
 def _painted_length(x: Array, dash_period: float) -> Array:
-    """Metres of paint on a dashed line between 0 and x."""
+    """Length of paint [m] on a dashed line between 0 and x."""
     period = np.floor(x / np.float32(dash_period))
     painted: Array = period * DASH_LENGTH + np.minimum(x - period * np.float32(dash_period), DASH_LENGTH)
     return painted

@@ -1,7 +1,8 @@
-"""Lanes of the roads that are not plain: winding ones with traffic both ways, and on-ramps.
+"""
+Lanes of winding roads with traffic in both directions, and of on-ramps.
 
-Their longitudinal coordinate is x (from the other end on lanes that are driven towards -x), the lateral one is measured
-along y, to the right of who drives on them: the conventions of highway-env's ``SineLane``.
+The longitudinal coordinate is x, counted from the other end on lanes driven towards -x. The lateral coordinate is
+measured along y, to the right of the driver. Both are in metres and follow highway-env's ``SineLane``.
 """
 
 from __future__ import annotations
@@ -15,16 +16,16 @@ from highway_env.vehicle.kinematics import Vehicle
 from sb3_have.envs.road import ROAD_LENGTH, SPEED_LIMIT, AxisLane, Placed
 from sb3_have.envs.road_shape import RoadShape
 
+# The two directions in a lane index; lane 0 is the leftmost of its direction
 FORWARD, ONCOMING = ("0", "1"), ("1", "0")
-"""The two directions in a lane index; lane 0 is the leftmost of those who drive it."""
 
 
 class BentLane(AxisLane):
     """
     A lane that bends with its road.
 
-    :param shape: of the road
-    :param number: of the lane, from the left; a lane among ``shape.oncoming`` is driven towards -x
+    :param shape: Shape of the road.
+    :param number: Number of the lane from the left; the first ``shape.oncoming`` lanes are driven towards -x.
     """
 
     def __init__(self, shape: RoadShape, number: int) -> None:
@@ -63,9 +64,9 @@ class BentLane(AxisLane):
 
 class RampLane(BentLane):
     """
-    All on-ramps of a road, one per period. Nobody changes to it; where it tapers off it is narrower.
+    All on-ramps of a straight road, one per period. Vehicles never change to it, and it narrows at its end.
 
-    :param shape: of the road, which is straight
+    :param shape: Shape of the road.
     """
 
     def __init__(self, shape: RoadShape) -> None:
@@ -94,7 +95,7 @@ class ShapedNetwork(RoadNetwork):
     """
     The lanes of a road.
 
-    :param shape: of the road
+    :param shape: Shape of the road.
     """
 
     def __init__(self, shape: RoadShape) -> None:
@@ -110,11 +111,11 @@ class ShapedNetwork(RoadNetwork):
             self.add_lane(*FORWARD, self.ramp)
 
     def bend(self, x: float) -> float:
-        """How far the road lies to the right of the x axis [m]."""
+        """Offset of the road to the right of the x axis [m] at x [m]."""
         return float(self.shape.bend(x))
 
     def get_closest_lane_index(self, position: np.ndarray, heading: float | None = None) -> LaneIndex:
-        # By place alone: who drives on the wrong side is on the wrong side.
+        # Ignore the heading: a vehicle on the wrong side of the road is in an oncoming lane
         shape, x, y = self.shape, float(position[0]), float(position[1])
         across = y - shape.bend(x)
         number = min(max(round(across / shape.lane_width), 0), shape.lanes_count - 1)

@@ -1,4 +1,4 @@
-"""Drivers on a highway with on-ramps: slow on the ramp, they join the traffic before its lane ends."""
+"""Drivers on a highway with on-ramps, who join the traffic before the ramp ends."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from sb3_have.envs.road_shape import PERIOD, RAMP_JOINS, RAMP_TAPERS
 
 class MergingDriver(ScenarioDriver):
     """
-    An IDM/MOBIL driver who, on a ramp, changes to the road as soon as MOBIL holds it to be safe.
+    An IDM/MOBIL driver that changes from a ramp to the road as soon as MOBIL considers it safe.
 
-    What counts as safe loosens along the acceleration lane: at its beginning nobody may have to brake harder than
-    :attr:`GENTLE`, at its end :attr:`HARD` will do. Until then the end of the lane is to it a car that stands there.
+    The criterion loosens along the acceleration lane: nobody may have to brake harder than :attr:`GENTLE` at its
+    beginning and :attr:`HARD` at its end. Until the lane change, the end of the lane counts as a standing car.
     """
 
+    # Hardest braking accepted at the beginning of the acceleration lane [m/s^2]
     GENTLE = 2.0
-    """[m/s^2]"""
+    # Hardest braking accepted at its end [m/s^2], the hardest of any driver
     HARD = 6.0
-    """[m/s^2], the most that any driver brakes"""
 
     target_lane_index: LaneIndex
+    # Desired speed after the curve of the ramp [m/s]
     cruise_speed: float
-    """What it wants to drive at once it has left the curve of the ramp [m/s]."""
 
     def act(self, action: Any = None) -> None:
         on_ramp = isinstance(self.lane, RampLane)
@@ -37,7 +37,8 @@ class MergingDriver(ScenarioDriver):
         if on_ramp and u >= RAMP_JOINS:
             self.target_speed = self.cruise_speed
         elif not on_ramp and isinstance(self.road.network.get_lane(self.target_lane_index), RampLane):
-            self.target_lane_index = self.lane_index  # the ramp is over
+            # The ramp has ended
+            self.target_lane_index = self.lane_index
             self.target_speed = self.cruise_speed
         super().act(action)
         if on_ramp and self.target_lane_index == self.lane_index and not self.crashed:
@@ -56,17 +57,17 @@ class MergingDriver(ScenarioDriver):
                 self.target_lane_index = (*FORWARD, self.lane_index[2] - 1)
 
     def _can_join(self, limit: float) -> bool:
-        """Whether neither it nor who comes behind it would have to brake harder than the limit [m/s^2]."""
+        """Whether neither this driver nor the one behind would have to brake harder than the limit [m/s^2]."""
         beside = (*FORWARD, self.lane_index[2] - 1)
         front, rear = self.road.neighbour_vehicles(self, beside)
         pairs = [(self, front), (rear, self)]
-        # Who is changing to the same lane counts as being there.
+        # Vehicles that are changing to the same lane count as being there
         for other in self.road.vehicles:
             if other is not self and getattr(other, "target_lane_index", None) == beside != other.lane_index:
                 pairs.append((other, self) if other.position[0] < self.position[0] else (self, other))
         return all(self._braking(behind, ahead) <= limit for behind, ahead in pairs if behind and ahead)
 
     def _braking(self, behind: Vehicle, ahead: Vehicle) -> float:
-        """How hard IDM brakes for the car ahead at the speed that it wants [m/s^2]."""
+        """Braking of IDM for the car ahead at its desired speed [m/s^2]."""
         distance = max(float(ahead.position[0] - behind.position[0]), 1e-2)
         return float(self.COMFORT_ACC_MAX) * max(self.desired_gap(behind, ahead) / distance, 0.0) ** 2

@@ -1,18 +1,18 @@
 """
 ReliabilityDrive-v0: a winding road seen through several vector sensors, any of which may fail at any time.
 
-A small task in which it matters whom to believe. The state of the drive is a vector of 12 numbers. Every modality shows
-it through a random layer of its own, by default all but two directions of it: one modality alone is not enough, any two
-are. They go black, freeze or turn to noise in segments of 25 steps on average; at least one is sound at any time, and
-nothing but the modality's own values, and how much they have just changed, tells which. That is easy to tell: the task
-is not to detect failures, but to make use of them. The pay goes with the speed to hold, which changes along the road,
-so that the value of a state depends on what a sound modality shows, however well the car is driven.
+A small task about which modality to trust. The state of the drive has 12 dimensions. Each modality observes it through
+a random layer of its own, by default all but two directions, so that one modality alone is not enough but any two are.
+Modalities go black, freeze or turn to noise in segments of 25 steps on average; at least one is always sound. Only the
+values of a modality, and how much they have just changed, reveal its condition. This is easy to detect: the task is not
+to detect failures but to use that knowledge. The reward depends on a target speed that changes along the road, so the
+value of a state depends on what the sound modalities show, however well the car is driven.
 
-All environments of a batch are simulated at once (:class:`DriveBatch`), each with a random generator of its own, so
-that a batch equals as many single ones step for step; :class:`ReliabilityDriveEnv` is a batch of one.
+All environments of a batch are simulated at once (:class:`DriveBatch`), each with its own random generator, so that a
+batch equals single environments step for step. :class:`ReliabilityDriveEnv` is a batch of one.
 
-Dynamics are in road coordinates: s along the road, y to the left of its centre, drift is the speed in y. Metres,
-seconds and radians. In the shapes, N is the number of environments, d of modalities.
+The dynamics use road coordinates: s along the road, y to the left of its centre, both in metres, and drift, the speed
+in y [m/s]. In the shapes, N is the number of environments and d the number of modalities.
 """
 
 from typing import Any, NamedTuple
@@ -23,64 +23,78 @@ from gymnasium import spaces
 
 CONDITIONS = ("sound", "black", "frozen", "noise")
 """
-What a modality can be in; all but the first are failures. A frozen one is stuck at what it would show in some other
-state, and so of no use from the first step on; a black one shows zeros, and noise has the size of what is sound.
+Conditions of a modality; all but the first are failures. A frozen modality is stuck at the frame of some other state,
+so it is useless from the first step on; a black one shows zeros; noise has the standard deviation of sound frames.
 """
 
+# Duration of a step [s]
 DT = 0.2
+# Half the width of the road [m]; beyond it the episode ends
 HALF_WIDTH = 5.0
-"""Of the road; beyond it the episode ends."""
+# Top speed of the car [m/s]
 TOP_SPEED = 18.0
+# Largest acceleration by throttle and by steering [m/s^2]
 ALONG, ACROSS = 4.0, 4.0
-"""Greatest acceleration [m/s^2] by throttle and steering."""
+# Decay rate of the drift [1/s]
 DRAG = 1.0
-"""By which the drift dies down [1/s]."""
+# Amplitude [1/m] and wavelength [m] of the waves that add up to the curvature of the road
 BENDS = np.array([[0.006, 190.0], [0.006, 110.0], [0.004, 61.0]])
-"""Amplitude [1/m] and wavelength [m] of the waves whose sum is the road's curvature."""
-SPEED_TO_HOLD = (10.0, 4.0, 160.0)
-"""Mean and amplitude [m/s] and wavelength [m] along the road."""
+# Mean [m/s], amplitude [m/s] and wavelength along the road [m] of the target speed
+TARGET_SPEED = (10.0, 4.0, 160.0)
+# Distances ahead [m] at which the state contains the curvature and the target speed
 PREVIEW = np.array([0.0, 10.0, 20.0])
-"""How far ahead [m] the state tells the curvature and the speed to hold."""
+# Speed of the obstacle along the road [m/s]
 OBSTACLE_SPEED = 5.0
+# Amplitude [m] and angular frequency [1/s] with which the obstacle sways across the road
 SWAY = (1.2, 0.4)
-"""Amplitude [m] and angular frequency [1/s] of the obstacle's way across the road."""
+# Distance along and across the road [m] at which the cost of the obstacle has fallen to 1/e
 CLEARANCE = (4.0, 1.6)
-"""Distance along and across the road [m] at which the obstacle's cost has fallen to 1/e."""
+# Offset, drift, speed; three curvatures, three target speeds; distance, offset and drift of the obstacle
 N_STATE = 12
-"""Offset, drift, speed; three curvatures, three speeds to hold; the obstacle's distance, offset and drift."""
 
+# Values per frame
 CHANNELS = 16
-"""Numbers in a frame."""
+# Gain of the random layer: how far the state reaches into the nonlinear range of its tanh
 GAIN = 1.2
-"""Of the random layer: how far into the bends of its tanh the state reaches."""
+# Standard deviation of the sensor noise
 SENSOR_NOISE = 0.02
+# Typical change of a value between frames. The second half of an observation is the change of each value, in octaves
+# relative to this one: about 0 for sound modalities, low for frozen and black ones, high for noise.
 TYPICAL_CHANGE = 0.05
-"""Of a number from frame to frame. The other half of an observation tells how lively each is, in octaves about this:
-sound modalities are, frozen and black ones are not, and noise is much too lively."""
+# Octaves per unit of an observation
 OCTAVES = 1.5
-"""One unit in an observation."""
+# Bound of an observation
 MAX_VALUE = 3.0
-"""Bound of an observation."""
+# Standard deviation of the random state at which a modality freezes, about that of the true state
 STUCK_STD = 0.5
-"""Standard deviation of the random state at which a modality freezes, about that of the true one."""
+# Standard deviation of a noise frame, about that of a sound one
 FAILURE_NOISE = 0.5
-"""Standard deviation of a frame of noise, about that of a sound one."""
+# Mean number of steps between two draws of the conditions
 MEAN_SEGMENT = 25
-"""Steps from one draw of the conditions to the next."""
+# Phases of the bends and of the target speed, start of the car, start of the obstacle
 N_RESET_DRAWS = len(BENDS) + 1 + 3 + 3
-"""Phases of bends and speed to hold, the car's start, the obstacle's."""
 
 
 class Encoding(NamedTuple):
-    """How the modalities show the state: all of it but some directions each, through a random layer."""
+    """
+    Random layers through which the modalities observe the state.
+
+    :param weight: Weights, (d, N_STATE, CHANNELS).
+    :param bias: Biases, (d, CHANNELS).
+    """
 
     weight: np.ndarray
-    """(d, N_STATE, CHANNELS)."""
     bias: np.ndarray
-    """(d, CHANNELS)."""
 
     @classmethod
     def draw(cls, n_modalities: int, n_blind: int, seed: int) -> "Encoding":
+        """
+        Draw the layers.
+
+        :param n_modalities: Number of modalities d.
+        :param n_blind: Number of directions of the state that each modality does not observe.
+        :param seed: Seed of the draw.
+        """
         rng = np.random.default_rng(seed)
         directions = np.linalg.qr(rng.normal(size=(N_STATE, N_STATE))).Q.T
         weight = rng.normal(size=(n_modalities, N_STATE, CHANNELS)) * GAIN / np.sqrt(N_STATE - n_blind)
@@ -90,27 +104,32 @@ class Encoding(NamedTuple):
         return cls(weight, 0.3 * rng.normal(size=(n_modalities, CHANNELS)))
 
     def __call__(self, state: np.ndarray) -> np.ndarray:
-        """Frames (N, d, CHANNELS) of states (N, N_STATE)."""
-        # A sum and not a matrix product, whose rounding depends on the number of rows
+        """
+        Return the frames of states.
+
+        :param state: States, (N, N_STATE).
+        :return: Frames, (N, d, CHANNELS).
+        """
+        # A sum instead of a matrix product, whose rounding would depend on N
         frames: np.ndarray = np.tanh((state[:, None, :, None] * self.weight).sum(axis=2) + self.bias)
         return frames
 
 
 class DriveBatch:
     """
-    N drives at once.
+    A batch of N drives.
 
-    :param num_envs: N
-    :param n_modalities: d, 2 to 6
-    :param corruption: probability with which a modality fails in a segment (if all would, one is spared); 0 is never
-    :param failure: (modality, kind): this modality is in this condition all the time, e.g. ``(0, "black")``; another
-        one stays sound
-    :param max_episode_steps: steps until an episode is cut
-    :param n_blind: directions of the 12-dimensional state that a modality does not see, 0 to 11; others for each as far
-        as there are enough. With 2 any two modalities of three show all of the state, with 8 each of three shows a part
-        of its own
-    :param encoding_seed: of the random encoding, which is part of the task and not of the episode
-    :raises ValueError: naming the option, if one is out of range
+    :param num_envs: Number of environments N.
+    :param n_modalities: Number of modalities d, 2 to 6.
+    :param corruption: Probability that a modality fails in a segment. If all would fail, one is spared.
+    :param failure: (modality, condition), e.g. ``(0, "black")``: this modality is always in this condition, and at
+        least one other is sound.
+    :param max_episode_steps: Steps after which an episode is truncated.
+    :param n_blind: Number of directions of the 12-dimensional state that a modality does not observe, 0 to 11;
+        different ones for each modality as far as possible. With 2, any two of three modalities together observe the
+        whole state; with 8, each of three observes a different part.
+    :param encoding_seed: Seed of the random layers, which belong to the task and not to the episode.
+    :raises ValueError: If an option is out of range.
     """
 
     def __init__(
@@ -137,11 +156,15 @@ class DriveBatch:
         self.phases = np.zeros((num_envs, len(BENDS) + 1))
         self.obstacle = np.zeros((num_envs, 3))  # s, mean offset, phase of its sway
         self.condition = np.zeros((num_envs, n_modalities), int)
-        self.stuck = np.zeros((num_envs, n_modalities, CHANNELS))  # what a frozen modality shows
-        self.frames = np.zeros((num_envs, n_modalities, 2 * CHANNELS), np.float32)  # and how lively each is
+        self.stuck = np.zeros((num_envs, n_modalities, CHANNELS))  # frames of frozen modalities
+        self.frames = np.zeros((num_envs, n_modalities, 2 * CHANNELS), np.float32)  # values and their changes
 
     def reset(self, rows: np.ndarray) -> None:
-        """Begins new episodes in these environments, int (n,)."""
+        """
+        Begin new episodes.
+
+        :param rows: Environments to reset, int (n,).
+        """
         draws = np.stack([self.rngs[row].random(N_RESET_DRAWS) for row in rows])
         n_phases = len(BENDS) + 1
         self.phases[rows] = 2 * np.pi * draws[:, :n_phases]
@@ -154,8 +177,10 @@ class DriveBatch:
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """
-        :param actions: (N, 2), throttle and steering to the left in [-1, 1]
-        :return: rewards, and whether the car left the road (the end) or the time is up, (N,) each
+        Simulate one step.
+
+        :param actions: Throttle and steering to the left in [-1, 1], (N, 2).
+        :return: Rewards, terminated (the car left the road) and truncated (the time is up), (N,) each.
         """
         throttle, push = np.clip(np.asarray(actions, dtype=float), -1, 1).T
         outwards = self.curvature(self.s) * self.speed**2
@@ -168,52 +193,61 @@ class DriveBatch:
 
         distance, offset, _ = self.obstacle_position()
         nearness = np.exp(-((distance / CLEARANCE[0]) ** 2) - (offset / CLEARANCE[1]) ** 2)
-        pace = np.maximum(0, 1 - np.abs(self.speed - self.speed_to_hold(self.s)) / 6)
-        rewards = self.speed / SPEED_TO_HOLD[0] * pace * (1 - (self.y / HALF_WIDTH) ** 2) - nearness
+        pace = np.maximum(0, 1 - np.abs(self.speed - self.target_speed(self.s)) / 6)
+        rewards = self.speed / TARGET_SPEED[0] * pace * (1 - (self.y / HALF_WIDTH) ** 2) - nearness
         left_road = np.abs(self.y) > HALF_WIDTH
         rewards = np.where(left_road, 0.0, rewards)
         self._sense(np.arange(self.num_envs))
         return rewards, left_road, ~left_road & (self.steps >= self.max_episode_steps)
 
     def _move_obstacle(self) -> None:
-        """It goes its way; once it has fallen behind, the next one is ahead."""
-        place, lane = np.stack([rng.random(2) for rng in self.rngs], axis=1)  # as many in every step
+        """Move the obstacle. Once it has fallen behind, the next one appears ahead."""
+        # Draw the same number in every step, so that the stream does not depend on the obstacle
+        place, lane = np.stack([rng.random(2) for rng in self.rngs], axis=1)
         self.obstacle[:, 0] += DT * OBSTACLE_SPEED
         behind = self.obstacle[:, 0] < self.s - 10
         self.obstacle[:, 0] = np.where(behind, self.s + 40 + 30 * place, self.obstacle[:, 0])
         self.obstacle[:, 1] = np.where(behind, 5 * lane - 2.5, self.obstacle[:, 1])
 
     def curvature(self, s: np.ndarray) -> np.ndarray:
-        """Of the road [1/m] at s (N,), left is positive."""
+        """
+        Return the curvature of the road [1/m], positive to the left, (N,).
+
+        :param s: Positions along the road [m], (N,).
+        """
         waves = BENDS[:, 0] * np.sin(2 * np.pi * s[:, None] / BENDS[:, 1] + self.phases[:, :-1])
         curvature: np.ndarray = waves.sum(axis=1)
         return curvature
 
-    def speed_to_hold(self, s: np.ndarray) -> np.ndarray:
-        """The speed to hold [m/s] at s (N,)."""
-        mean, amplitude, wavelength = SPEED_TO_HOLD
+    def target_speed(self, s: np.ndarray) -> np.ndarray:
+        """
+        Return the target speed [m/s], (N,).
+
+        :param s: Positions along the road [m], (N,).
+        """
+        mean, amplitude, wavelength = TARGET_SPEED
         speed: np.ndarray = mean + amplitude * np.sin(2 * np.pi * s / wavelength + self.phases[:, -1])
         return speed
 
     def obstacle_position(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Distance along the road and offset across it [m], relative to the car, and drift [m/s], (N,) each."""
+        """Return distance along and offset across the road [m], relative to the car, and drift [m/s], (N,) each."""
         amplitude, frequency = SWAY
         phase = frequency * DT * self.steps + self.obstacle[:, 2]
         offset = self.obstacle[:, 1] + amplitude * np.sin(phase) - self.y
         return self.obstacle[:, 0] - self.s, offset, amplitude * frequency * np.cos(phase)
 
     def state(self) -> np.ndarray:
-        """What there is to know, (N, N_STATE), in numbers of about 1."""
-        mean, amplitude, _ = SPEED_TO_HOLD
+        """Return the state, scaled to values of about 1, (N, N_STATE)."""
+        mean, amplitude, _ = TARGET_SPEED
         distance, offset, drift = self.obstacle_position()
         columns = [self.y / HALF_WIDTH, self.drift / 2, (self.speed - mean) / 4]
         columns += [100 * self.curvature(self.s + ahead) for ahead in PREVIEW]
-        columns += [(self.speed_to_hold(self.s + ahead) - mean) / amplitude for ahead in PREVIEW]
+        columns += [(self.target_speed(self.s + ahead) - mean) / amplitude for ahead in PREVIEW]
         columns += [np.clip(distance / 20, -1, 2), np.clip(offset / 4, -2, 2), 2 * drift]
         return np.stack(columns, axis=1)
 
     def _sense(self, rows: np.ndarray, first: bool = False) -> None:
-        """Draws conditions and takes the next frame in these environments, all of which begin an episode or none."""
+        """Draw conditions and make the next frames. Either all of these environments begin an episode, or none."""
         d = self.n_modalities
         uniform = np.stack([self.rngs[row].random(2 + 2 * d) for row in rows])
         normal = np.stack([self.rngs[row].standard_normal((d, CHANNELS)) for row in rows])
@@ -222,7 +256,8 @@ class DriveBatch:
         elsewhere = np.stack([self.rngs[row].standard_normal(N_STATE) for row in rows])
         sticks = np.repeat(changes[:, None], d, axis=1)
         if self.failure is not None:
-            sticks[:, self.failure[0]] = first  # what fails for whole episodes shows the same for whole episodes
+            # A modality that is frozen for whole episodes does not change within them
+            sticks[:, self.failure[0]] = first
         self.stuck[rows] = np.where(sticks[:, :, None], self.encoding(STUCK_STD * elsewhere), self.stuck[rows])
         sound = np.clip(self.encoding(self.state()[rows]) + SENSOR_NOISE * normal, -MAX_VALUE, MAX_VALUE)
         noise = np.clip(FAILURE_NOISE * normal, -MAX_VALUE, MAX_VALUE)
@@ -234,7 +269,7 @@ class DriveBatch:
         self.frames[rows, :, CHANNELS:] = 0 if first else np.clip(octaves / OCTAVES, -MAX_VALUE, MAX_VALUE)
 
     def _draw_conditions(self, uniform: np.ndarray) -> np.ndarray:
-        """Of a new segment, int (n, d), from uniform numbers (n, 1 + 2 d)."""
+        """Draw the conditions of new segments, int (n, d), from uniform numbers (n, 1 + 2 d)."""
         d = self.n_modalities
         fails = uniform[:, 1 : 1 + d] < self.corruption
         spared = (d * uniform[:, 0]).astype(int)
@@ -249,17 +284,20 @@ class DriveBatch:
 
     @property
     def reliable(self) -> np.ndarray:
-        """Which modality is sound, bool (N, d)."""
+        """Whether each modality is sound, bool (N, d)."""
         return np.equal(self.condition, 0)
 
     def observation(self) -> dict[str, np.ndarray]:
-        """Of all environments, {modality: float32 (N, 2 * CHANNELS)}: the frame, and how lively each number is."""
+        """Return the values and their changes by modality, float32 (N, 2 * CHANNELS) each."""
         return {f"m{i}": self.frames[:, i].reshape(self.num_envs, -1).copy() for i in range(self.n_modalities)}
 
     def info(self, row: int) -> dict[str, Any]:
         """
-        Of one environment: ``reliable`` bool (d,), ``condition`` (names), ``distance`` [m], ``speed`` [m/s],
-        ``offroad``.
+        Return the info of one environment.
+
+        :param row: Number of the environment.
+        :return: ``reliable`` (bool (d,), whether each modality is sound), ``condition`` (its name), ``distance`` [m],
+            ``speed`` [m/s] and ``offroad``.
         """
         return {
             "reliable": self.reliable[row],
@@ -272,15 +310,21 @@ class DriveBatch:
 
 class ReliabilityDriveEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
     """
-    One drive. Observation: ``m0``, ``m1``, ... float32 (32,) each, the 16 numbers of a frame and how lively each is.
-    Action: throttle and steering to the left, in [-1, 1]. Reward of a step: v / 10 m/s, times
-    ``1 - |v - v_hold| / 6 m/s`` (at least 0), times 1 - (y / 5 m)^2, less the nearness of the obstacle (1 at its
-    centre). Leaving the road ends the episode; 200 steps cut it. A driver by rule who knows the state gets 179.
+    One drive with a Dict of vectors as observations.
 
-    ``info["reliable"]`` (d,) is the truth about the modalities, for study; see :meth:`DriveBatch.info`.
+    Observation: ``m0``, ``m1``, ..., float32 (32,) each: the 16 values of a frame and their changes. Action: throttle
+    and
+    steering to the left in [-1, 1]. Reward per step::
 
-    :param render_mode: None, there is nothing to see
-    :param options: of :class:`DriveBatch`
+        v / 10 m/s * max(0, 1 - |v - v_target| / 6 m/s) * (1 - (y / 5 m)^2) - exp(-(dx / 4 m)^2 - (dy / 1.6 m)^2)
+
+    where dx and dy are the distances to the obstacle along and across the road. Leaving the road terminates the episode
+    with reward 0; 200 steps truncate it. A rule-based driver that knows the state gets a return of 179.
+
+    ``info["reliable"]`` states which modalities are sound, for analysis; see :meth:`DriveBatch.info`.
+
+    :param render_mode: Must be None; there is nothing to see.
+    :param options: Options of :class:`DriveBatch`.
     """
 
     metadata = {"render_modes": []}  # noqa: RUF012
@@ -310,19 +354,18 @@ class ReliabilityDriveEnv(gym.Env[dict[str, np.ndarray], np.ndarray]):
 def _check_options(
     n_modalities: int, corruption: float, failure: tuple[int, str] | None, max_episode_steps: int, n_blind: int
 ) -> None:
-    if not (isinstance(n_modalities, int) and 2 <= n_modalities <= 6):
-        raise ValueError(f"n_modalities={n_modalities!r}: expected a whole number from 2 to 6.")
+    if n_modalities not in range(2, 7):
+        raise ValueError(f"n_modalities must be a whole number in 2..6, got {n_modalities!r}")
     if not 0 <= corruption <= 1:
-        raise ValueError(f"corruption={corruption!r}: expected a probability in [0, 1].")
-    if not (isinstance(max_episode_steps, int) and max_episode_steps >= 1):
-        raise ValueError(f"max_episode_steps={max_episode_steps!r}: expected a whole number of steps, from 1 on.")
-    if not (isinstance(n_blind, int) and 0 <= n_blind < N_STATE):
-        raise ValueError(f"n_blind={n_blind!r}: expected a whole number of directions from 0 to {N_STATE - 1}.")
-    if failure is None:
-        return
-    if not (isinstance(failure, (tuple, list)) and len(failure) == 2):
-        raise ValueError(f"failure={failure!r}: expected (modality, kind), e.g. (0, 'black').")
-    if failure[0] not in range(n_modalities):
-        raise ValueError(f"failure={failure!r}: expected a modality from 0 to {n_modalities - 1}.")
-    if failure[1] not in CONDITIONS[1:]:
-        raise ValueError(f"failure={failure!r}: expected a kind out of {CONDITIONS[1:]}.")
+        raise ValueError(f"corruption must be a probability in 0..1, got {corruption!r}")
+    if not max_episode_steps >= 1:
+        raise ValueError(f"max_episode_steps must be >= 1, got {max_episode_steps!r}")
+    if n_blind not in range(N_STATE):
+        raise ValueError(f"n_blind must be a whole number in 0..{N_STATE - 1}, got {n_blind!r}")
+    if failure is not None and (
+        len(failure) != 2 or failure[0] not in range(n_modalities) or failure[1] not in CONDITIONS[1:]
+    ):
+        raise ValueError(
+            f"failure must be (modality, condition) with a modality in 0..{n_modalities - 1} and one of "
+            f"{CONDITIONS[1:]}, got {failure!r}"
+        )

@@ -1,9 +1,10 @@
-"""A highway that computes what :mod:`highway_env` computes, bit for bit, in less time.
+"""
+A straight highway that behaves like that of :mod:`highway_env`, bit for bit, but is faster.
 
-Every vehicle looks for its neighbours several times per simulation step and every pair of vehicles is checked for a
-collision. On a road that leads along x both are answered from plain floats. Only public methods are overridden;
-``benchmarks/road_identity.py`` drives this road and the stock one side by side. Lanes that are not straight are in
-:mod:`sb3_have.envs.lanes`.
+Every vehicle looks up its neighbours several times per simulation step, and every pair of vehicles is checked for
+collisions. On a road along x, plain floats suffice for both. Only public methods are overridden;
+``benchmarks/road_identity.py`` compares this road with that of highway-env. :mod:`sb3_have.envs.lanes` has the lanes
+that are not straight.
 """
 
 from __future__ import annotations
@@ -18,25 +19,24 @@ from highway_env.road.lane import LineType, StraightLane
 from highway_env.road.road import LaneIndex, Road, RoadNetwork
 from highway_env.vehicle.kinematics import Vehicle
 
+# Width of a lane [m]. The centre of lane k is at y = k * LANE_WIDTH; y points to the right.
 LANE_WIDTH: float = StraightLane.DEFAULT_WIDTH
-"""Width of a lane [m]; the centre of lane ``k`` is at ``y = k * LANE_WIDTH``, y pointing to the right."""
 
+# Length of the road [m], longer than any episode
 ROAD_LENGTH = 1e6
-"""Longer than any episode drives [m]."""
 
+# Highest desired speed of the traffic [m/s], the default of highway-env
 SPEED_LIMIT = 30.0
-"""No traffic wants to be faster [m/s]; highway-env's default."""
 
-
+# x [m], y [m], offset of the road to the right of the x axis at x [m], and the vehicle
 Placed = tuple[float, float, float, Vehicle]
-"""x [m], y [m], how far the road lies to the right of the x axis there [m], and the vehicle."""
 
 
 class AxisLane(StraightLane):
-    """A straight lane along +x: its coordinates are differences, no dot product is needed."""
+    """A straight lane along +x, whose coordinates are differences instead of dot products."""
 
+    # +1 for a lane driven towards +x, -1 towards -x
     sign = 1.0
-    """+1 where it is driven towards +x, -1 where towards -x."""
 
     def __init__(self, start: Sequence[float], end: Sequence[float], **kwargs: Any) -> None:
         super().__init__(start, end, **kwargs)
@@ -49,15 +49,16 @@ class AxisLane(StraightLane):
         return 0.0
 
     def occupants(self, placed: list[Placed]) -> list[tuple[float, Vehicle]]:
-        """Who is on the lane or straddles its border, and how far along."""
+        """Vehicles on the lane or across its border, with their positions along the lane [m]."""
         centre = self.centre
         return [(x, vehicle) for x, y, _, vehicle in placed if abs(y - centre) <= LANE_WIDTH / 2 + 1]
 
 
 class HighwayNetwork(RoadNetwork):
-    """Parallel lanes along +x.
+    """
+    Parallel lanes along +x.
 
-    :param lanes_count: number of lanes; lane 0 is the leftmost
+    :param lanes_count: Number of lanes; lane 0 is the leftmost.
     """
 
     def __init__(self, lanes_count: int) -> None:
@@ -70,7 +71,7 @@ class HighwayNetwork(RoadNetwork):
             self.add_lane("0", "1", lane)
 
     def bend(self, x: float) -> float:
-        """How far the road lies to the right of the x axis [m]."""
+        """Offset of the road to the right of the x axis [m] at x [m]."""
         return 0.0
 
     def get_closest_lane_index(self, position: np.ndarray, heading: float | None = None) -> LaneIndex:
@@ -82,14 +83,14 @@ class HighwayNetwork(RoadNetwork):
 
 
 class HighwayRoad(Road):
-    """A :class:`~highway_env.road.road.Road` on lanes that lead along x, with cheap neighbours and collisions."""
+    """A :class:`~highway_env.road.road.Road` along x with fast look-ups of neighbours and collisions."""
 
     _placed: list[Placed] | None = None
     _on_lane: dict[LaneIndex, list[tuple[float, Vehicle]]]
     _motions: dict[Vehicle, tuple[np.ndarray, np.ndarray]]
 
     def act(self) -> None:
-        # Nobody moves while everybody decides: place each vehicle on each lane only once.
+        # No vehicle moves while all decide, so assign vehicles to lanes only once
         self._placed = self._places()
         self._on_lane, self._motions = {}, {}
         try:
@@ -124,7 +125,7 @@ class HighwayRoad(Road):
         return front, rear
 
     def motion(self, vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray]:
-        """A vehicle's direction, a unit vector, and its velocity [m/s]."""
+        """Direction (a unit vector) and velocity [m/s] of a vehicle."""
         motion = None if self._placed is None else self._motions.get(vehicle)
         if motion is None:
             direction = vehicle.direction
@@ -140,7 +141,7 @@ class HighwayRoad(Road):
             vehicle.handle_collisions(other, dt)
 
     def _close_pairs(self, dt: float) -> list[tuple[Vehicle, Vehicle]]:
-        """All pairs that ``handle_collisions`` might find to collide and few others, in the order of the vehicles."""
+        """All pairs that ``handle_collisions`` might find to collide, and few others, in the order of the vehicles."""
         reach = max(v.diagonal for v in self.vehicles) + max(abs(v.speed) for v in self.vehicles) * dt + 1.0
         along = sorted((float(v.position[0]), number) for number, v in enumerate(self.vehicles))
         pairs = []
@@ -155,14 +156,15 @@ class HighwayRoad(Road):
 
 def _pass_by(one: Vehicle, other: Vehicle, dt: float) -> bool:
     """
-    Whether two vehicles are sure to stay clear of each other, side by side, for another step: whether they and their
-    motion leave a gap across the one's heading, one of the four directions in which ``handle_collisions`` would look
-    for it at length.
+    Check whether two vehicles are certain to stay clear of each other, side by side, for another step.
+
+    They are if they and their motion leave a gap across the heading of the first, one of the four directions that
+    ``handle_collisions`` examines.
     """
     heading, turn = float(one.heading), float(other.heading - one.heading)
     dx, dy = (other.position - one.position).tolist()
     gap = abs(dy * math.cos(heading) - dx * math.sin(heading))
     slant = abs(math.sin(turn))
     half_widths = 0.5 * (one.WIDTH + slant * other.LENGTH + abs(math.cos(turn)) * other.WIDTH)
-    # The one moves along its heading, not across it. The centimetre is far more than any rounding.
+    # The first vehicle moves along its heading, not across it. The centimetre is far more than any rounding error.
     return bool(gap > half_widths + abs(other.speed) * dt * slant + 0.01)

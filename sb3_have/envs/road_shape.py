@@ -1,8 +1,10 @@
-"""Where a road runs and how it is divided: what its lanes, on which cars drive, and its picture have in common.
+"""
+The geometry of a road, shared by its lanes and its picture.
 
-World coordinates: x forward, y to the right, metres; every road leads towards +x. *Across* is y less the road's bend at
-the same x, so that lane k has its centre at across = k * lane_width on any road. All shapes repeat themselves along x
-with :data:`PERIOD`.
+World coordinates in metres: x forward, y to the right; every road leads towards +x. *Across* is y minus the bend of the
+road at the same x, so that the centre of lane k is at across = k * lane_width on any road. All shapes repeat along x
+with
+:data:`PERIOD`.
 """
 
 from __future__ import annotations
@@ -13,19 +15,18 @@ from typing import Any, Final
 
 import numpy as np
 
-#: The roads repeat themselves [m].
+# Period of the roads [m]
 PERIOD: Final = 480.0
-#: How far the centre line of a winding road swings to either side [m]: its radius is 486 m where it is least.
+# Amplitude of a winding road [m]; its smallest radius is 486 m
 SWING: Final = 12.0
-#: A ramp begins this far to the right of where it joins the road [m] ...
+# Offset to the right at which a ramp begins [m]
 RAMP_OFFSET: Final = 36.0
-#: ... and, metres from its beginning: where it becomes a lane beside the road, where that lane begins to taper and
-#: where nothing is left of it.
+# Distances from the beginning of a ramp [m] at which it becomes a lane beside the road, begins to taper, and ends
 RAMP_JOINS: Final = 240.0
 RAMP_TAPERS: Final = 420.0
 RAMP_ENDS: Final = 460.0
 
-#: The pavement goes on beyond the outer lines [m].
+# Width of the pavement beyond the outer lines [m]
 SHOULDER_WIDTH: Final = 2.0
 
 _WAVE: Final = 2 * math.pi / PERIOD
@@ -36,12 +37,12 @@ SCENARIOS: Final = ("highway", "merge", "curves")
 @dataclass(frozen=True)
 class RoadShape:
     """
-    The geometry of a road. Functions of x take a float or an array of any shape and precision and return the like.
+    The geometry of a road. Functions of x accept a float or an array of any shape and precision and return the same.
 
-    :param lanes_count: Lanes, not counting ramps; lane 0 is the leftmost.
-    :param lane_width: In metres.
-    :param swing: Amplitude in metres of the sine that the road follows; 0 for a straight road.
-    :param oncoming: How many lanes, from the left, are driven towards -x.
+    :param lanes_count: Number of lanes, not counting ramps; lane 0 is the leftmost.
+    :param lane_width: Width of a lane in metres.
+    :param swing: Amplitude of the sine that the road follows in metres; 0 for a straight road.
+    :param oncoming: Number of lanes, from the left, that are driven towards -x.
     :param ramps: Whether a ramp joins the road from the right in every period.
     """
 
@@ -58,40 +59,40 @@ class RoadShape:
 
     @property
     def right_edge(self) -> float:
-        """Across coordinate of the right edge of the right-most lane, not counting ramps."""
+        """Across coordinate of the right edge of the rightmost lane [m], not counting ramps."""
         return (self.lanes_count - 0.5) * self.lane_width
 
     @property
     def middle(self) -> float:
-        """Across coordinate of the middle of the road, not counting ramps."""
+        """Across coordinate of the middle of the road [m], not counting ramps."""
         return 0.5 * (self.lanes_count - 1) * self.lane_width
 
     @property
     def half_width(self) -> float:
-        """Half the width of the pavement, shoulders included, not counting ramps."""
+        """Half the width of the pavement with its shoulders [m], not counting ramps."""
         return 0.5 * self.lanes_count * self.lane_width + SHOULDER_WIDTH
 
     def bend(self, x: Any) -> Any:
-        """How far the road lies to the right of the x axis [m]."""
+        """Offset of the road to the right of the x axis [m] at x [m]."""
         return self.swing * _sin(_WAVE * x)
 
     def slope(self, x: Any) -> Any:
-        """Derivative of :meth:`bend`, the tangent of the road's heading."""
+        """Derivative of :meth:`bend`, the tangent of the heading of the road at x [m]."""
         return self.swing * 2 * math.pi / PERIOD * _sin(_WAVE * x + 0.5 * math.pi)
 
     def direction(self, x: float) -> tuple[float, float]:
-        """Unit vector along the road."""
+        """Unit vector along the road at x [m]."""
         if not self.swing:
             return 1.0, 0.0
         heading = math.atan(self.slope(x))
         return math.cos(heading), math.sin(heading)
 
     def has_ramp(self, x: Any, until: float = RAMP_ENDS) -> Any:
-        """Whether there is a ramp at x that began less than so many metres before."""
+        """Whether there is a ramp at x [m] that began less than ``until`` [m] before."""
         return self.ramps & (x % PERIOD < until)
 
     def ramp(self, x: Any) -> tuple[Any, Any]:
-        """Across coordinates of a ramp's left and right edge; both are the road's own edge where there is no ramp."""
+        """Across coordinates [m] of the edges of the ramp at x [m]; both are the edge of the road if there is none."""
         if not self.ramps:
             return self.right_edge + 0 * x, self.right_edge + 0 * x
         u = x % PERIOD
@@ -101,7 +102,7 @@ class RoadShape:
         return left, left + self.lane_width * (1 - _positive(taper) + _positive(taper - 1))
 
     def ramp_slope(self, x: Any) -> tuple[Any, Any]:
-        """Derivatives of the edges that :meth:`ramp` returns."""
+        """Derivatives of the edges that :meth:`ramp` returns at x [m]."""
         if not self.ramps:
             return 0 * x, 0 * x
         u = x % PERIOD
@@ -112,21 +113,21 @@ class RoadShape:
 
 def road_shape(scenario: str, lanes_count: int, lane_width: float = 4.0) -> RoadShape:
     """
-    The road of a scenario.
+    Return the road of a scenario.
 
-    :param scenario: "highway", straight, all lanes towards +x; "merge", the same with an on-ramp every 480 m; "curves",
-        winding, the left half of the lanes driven towards -x.
-    :param lanes_count: Lanes in all, not counting ramps.
-    :param lane_width: In metres.
-    :raises ValueError: on an unknown scenario or a number of lanes that it cannot have.
+    :param scenario: "highway" is straight with all lanes towards +x, "merge" has an additional on-ramp every 480 m,
+        "curves" is winding with the left half of the lanes towards -x.
+    :param lanes_count: Number of lanes, not counting ramps.
+    :param lane_width: Width of a lane in metres.
+    :raises ValueError: If the scenario is unknown or cannot have this number of lanes.
     """
     if scenario not in SCENARIOS:
         raise ValueError(f"scenario must be one of {', '.join(SCENARIOS)}; got {scenario!r}")
     if scenario == "curves":
         if lanes_count % 2:
             raise ValueError(
-                f"lanes_count must be even in scenario 'curves', which has half of the lanes in either direction; "
-                f"got {lanes_count}, choose {f'{lanes_count - 1} or ' if lanes_count > 1 else ''}{lanes_count + 1}"
+                f"lanes_count must be even in scenario 'curves', which has half of the lanes in each direction, got "
+                f"{lanes_count}"
             )
         return RoadShape(lanes_count, lane_width, swing=SWING, oncoming=lanes_count // 2)
     return RoadShape(lanes_count, lane_width, ramps=scenario == "merge")
@@ -137,5 +138,5 @@ def _sin(x: Any) -> Any:
 
 
 def _positive(x: Any) -> Any:
-    """The larger of x and 0."""
+    """Larger of x and 0."""
     return 0.5 * (x + abs(x))

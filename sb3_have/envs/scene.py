@@ -1,6 +1,7 @@
-"""What stands on and along the road, in world coordinates: x forward, y to the right, z up, metres.
+"""
+Objects on and along the road, in world coordinates in metres: x forward, y to the right, z up.
 
-Everything that rises from the ground is a vertical rectangle (a fir is a triangle) with a small texture of materials.
+Everything above the ground is a vertical rectangle (a fir is a triangle) with a small texture of materials.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ from sb3_have.envs.road_shape import PERIOD, SHOULDER_WIDTH, RoadShape
 Array = NDArray[np.floating]
 IntArray = NDArray[np.integer]
 
-# Materials: rows of the albedo table. Vehicle n has material BODY + n.
+# Materials, the rows of the albedo table; vehicle n has the material BODY + n
 GLASS, RUBBER, LAMP, STEEL, JOINT, LEAVES, LEAVES_DARK, HEADLAMP, BODY = range(9)
-#: Albedo (red, green, blue) of the materials below BODY.
+# Albedo (red, green, blue) of the materials below BODY
 ALBEDO: Final = np.array(
     [
         (0.03, 0.035, 0.04),
@@ -32,8 +33,8 @@ ALBEDO: Final = np.array(
     ],
     dtype=np.float32,
 )
-#: Paint of vehicles: white, silver, black, red, blue, yellow, green. None is as bright as the road, which an event
-#: camera could not tell from it.
+# Paints of vehicles: white, silver, black, red, blue, yellow, green. None is as bright as the road, or an event camera
+# could not distinguish it.
 PAINTS: Final = np.array(
     [
         (0.80, 0.80, 0.78),
@@ -50,43 +51,43 @@ ASPHALT: Final = np.array((0.11, 0.11, 0.115), dtype=np.float32)
 MARKING: Final = np.array((0.70, 0.70, 0.68), dtype=np.float32)
 VERGE: Final = np.array((0.10, 0.17, 0.05), dtype=np.float32)
 
+# Height of vehicles, width of lines, length and period of dashes, also beside a ramp [m]
 VEHICLE_HEIGHT: Final = 1.5
 LINE_WIDTH: Final = 0.2
 DASH_LENGTH: Final = 3.0
 DASH_PERIOD: Final = 12.0
-#: Beside a ramp the road's edge is dashed more densely.
 RAMP_DASH_PERIOD: Final = 6.0
-#: Two solid lines part the directions, their middles so far to either side of the centre.
+# Distance of each of the two lines between the directions from their centre [m]
 CENTRE_LINES: Final = 0.2
-#: The roadside repeats itself with this period, and positions are taken modulo it: single precision holds on any road.
-#: A multiple of all that repeats on its own: the road's shape, dashes (12 m), trees (20 m), joints (4 m) and the verge
-#: (64 m).
+# Period of the roadside [m]. Positions are taken modulo this period, so that single precision suffices on any road. It
+# is a multiple of the periods of the road, dashes (12 m), trees (20 m), joints (4 m) and verge (64 m).
 WORLD_PERIOD: Final = 2 * PERIOD
-#: Guard-rails stand so far beyond the pavement.
+# Guard-rails: distance from the pavement, lower and upper edge, distance between joints [m]
 RAIL_SETBACK: Final = 0.5
 RAIL_BOTTOM: Final = 0.45
 RAIL_TOP: Final = 0.8
 RAIL_JOINTS: Final = 4.0
-#: Where a guard-rail is not straight it is drawn in pieces of this length, a whole number of joints.
+# Length of the pieces in which curved guard-rails are drawn [m], a whole number of joints
 RAIL_PIECE: Final = 20.0
+# Trees: height, half width, spacing along the road, distance up to which they are drawn [m]
 TREE_HEIGHT: Final = 7.0
 TREE_HALF_WIDTH: Final = 1.6
 TREE_SPACING: Final = 20.0
 TREE_RANGE: Final = 140.0
 
-#: Cells of every texture, over the height and over the length of a face.
+# Cells of every texture along the height and the length of a face
 TEXTURE_ROWS, TEXTURE_COLUMNS = 10, 20
 
 
 def _texture(*rows: str) -> NDArray[np.int64]:
-    """A face drawn in letters, top row first; stored bottom row first."""
+    """Convert a face drawn in letters, top row first, to materials, bottom row first."""
     letters = {"g": GLASS, "k": RUBBER, "l": LAMP, "s": STEEL, "j": JOINT, "t": LEAVES, "d": LEAVES_DARK, "b": BODY}
     letters["h"] = HEADLAMP
     drawn = np.array([[letters[letter] for letter in row] for row in rows[::-1]])
     return drawn.repeat(TEXTURE_ROWS // len(drawn), axis=0).repeat(TEXTURE_COLUMNS // len(drawn[0]), axis=1)
 
 
-# Kinds of faces: rows of the table of textures.
+# Kinds of faces, the rows of the table of textures
 REAR, FRONT, SIDE, RAIL, TREE, FRONT_LIT = range(6)
 TEXTURES: Final = np.stack(
     [
@@ -122,7 +123,7 @@ TEXTURES: Final = np.stack(
 )
 
 
-#: Heights of the lower and the upper edge of each kind of face.
+# Heights of the lower and the upper edge of each kind of face [m]
 BOTTOM: Final = np.array((0.0, 0.0, 0.0, RAIL_BOTTOM, 0.0, 0.0))
 TOP: Final = np.array((*3 * (VEHICLE_HEIGHT,), RAIL_TOP, TREE_HEIGHT, VEHICLE_HEIGHT))
 
@@ -130,25 +131,41 @@ TOP: Final = np.array((*3 * (VEHICLE_HEIGHT,), RAIL_TOP, TREE_HEIGHT, VEHICLE_HE
 @dataclass
 class Faces:
     """
-    Vertical rectangles, (instants, faces, ...) each. Seen from outside, ``start`` is their left end. How high they
-    stand depends on their kind, see :data:`BOTTOM` and :data:`TOP`.
+    Vertical rectangles, (instants, faces, ...) each. Their heights follow from their kind, see :data:`BOTTOM` and
+    :data:`TOP`.
+
+    :param start: x, y of the left end, seen from outside [m].
+    :param end: x, y of the right end [m].
+    :param normal: Outward normal.
+    :param s_start: Place of the left end on the texture, which repeats with period 1.
+    :param s_end: Place of the right end on the texture.
+    :param kind: Kind of face.
+    :param vehicle: Number of the traffic vehicle or -1.
     """
 
-    start: Array  # x, y
+    start: Array
     end: Array
-    normal: Array  # outward
-    s_start: Array  # place on the texture, which repeats with period 1
+    normal: Array
+    s_start: Array
     s_end: Array
     kind: IntArray
-    vehicle: IntArray  # number of the traffic vehicle, or -1
+    vehicle: IntArray
 
     @staticmethod
     def concatenate(*parts: Faces) -> Faces:
-        """All faces of the parts, in their order."""
+        """
+        Concatenate faces.
+
+        :param parts: Faces in their order.
+        """
         return Faces(*(np.concatenate([getattr(part, f.name) for part in parts], axis=1) for f in fields(Faces)))
 
     def take(self, flat: IntArray) -> Faces:
-        """Some of the faces, by their index in the flattened arrays; the result has a single axis of faces."""
+        """
+        Select faces; the result has a single axis of faces.
+
+        :param flat: Indices into the flattened arrays.
+        """
         start, end, normal = (part.reshape(-1, 2).take(flat, axis=0) for part in (self.start, self.end, self.normal))
         s_start, s_end = self.s_start.take(flat), self.s_end.take(flat)
         return Faces(start, end, normal, s_start, s_end, self.kind.take(flat), self.vehicle.take(flat))
@@ -158,7 +175,7 @@ class Roadside:
     """
     Guard-rails and firs along a road, the same in every episode.
 
-    :param shape: Of the road.
+    :param shape: Shape of the road.
     """
 
     def __init__(self, shape: RoadShape) -> None:
@@ -168,17 +185,21 @@ class Roadside:
 
     def faces(self, x: Array, sight: float) -> tuple[Faces, Faces]:
         """
-        Trees and rails that can be seen from each x; far to near on a plain road.
+        Return the trees and the rails that are visible, far to near on a plain road.
 
-        :param x: Positions along the road, (instants,).
-        :param sight: Distance at which the guard-rails end.
+        :param x: Position of the camera along the road in metres, (instants,).
+        :param sight: Distance at which the guard-rails end in metres.
         """
         return self._trees(x), self._rail(x, sight) if self.shape.plain else self._pieces(x, sight)
 
     def behind_rail(self, y: Array) -> Array:
         """
-        How far what has this y stands behind the road's own right rail, where a ramp is: 0 from the road to the rail, 1
-        from the ramp on, and between the two so gradually that who is farther along never comes to stand before others.
+        Return how far objects stand behind the right rail of the road where there is a ramp, 0 to 1.
+
+        It is 0 from the road to the rail and 1 from the ramp on. In between it grows so gradually that a vehicle never
+        hides others that are closer.
+
+        :param y: Position of the objects across the road in metres.
         """
         if not self.shape.ramps:
             return np.zeros(y.shape)
@@ -186,7 +207,7 @@ class Roadside:
         return np.asarray(np.clip((y - rail) / self.shape.lane_width, 0, 1))
 
     def _trees(self, x: Array) -> Faces:
-        # Every instant has the faces around its own x, so that it looks the same whichever others are rendered with it.
+        # Use the faces around the x of each instant, so that it does not depend on the other instants
         number = (x[:, None] // TREE_SPACING).astype(np.int64) + np.arange(int(TREE_RANGE / TREE_SPACING), -1, -1)
         tree = self._jitter[number % len(self._jitter)]
         tree[..., 0] += TREE_SPACING * number[..., None]
@@ -207,7 +228,7 @@ class Roadside:
         )
 
     def _rail(self, x: Array, sight: float) -> Faces:
-        """The left and the right rail of a plain road, in one piece each."""
+        """Left and right rail of a plain road, in one piece each."""
         near, far = x - 5, x + sight
         y = np.tile(self.shape.middle + np.array((-1, 1)) * (self.shape.half_width + RAIL_SETBACK), (len(x), 1))
         s_near = near % RAIL_JOINTS / RAIL_JOINTS
@@ -219,7 +240,7 @@ class Roadside:
     def _pieces(self, x: Array, sight: float) -> Faces:
         """Rails that follow the road: left, right, and between the road and a ramp that is about to join."""
         number = x[:, None] // RAIL_PIECE + np.arange(-1, int(sight / RAIL_PIECE) + 1)
-        # Just inside of the piece, for where a ramp begins there is a step.
+        # Just inside of the piece, because there is a step where a ramp begins
         near, far = RAIL_PIECE * number + 1e-3, RAIL_PIECE * (number + 1) - 1e-3
         shift = self.shape.half_width + RAIL_SETBACK
         left, right = self.shape.middle - shift, self.shape.middle + shift
@@ -227,7 +248,7 @@ class Roadside:
         outer = [(np.stack((u, right + self.shape.bend(u) + self._widening(u)), axis=-1)) for u in (far, near)]
         starts, stops = [ends[0], outer[0]], [ends[1], outer[1]]
         if self.shape.ramps:
-            # The road's own rail ends where there is no more room for it; from there on it has no length.
+            # The rail of the road ends where there is no more room for it; from there on its length is 0
             gap = self.shape.ramp(far)[0] - self.shape.right_edge - 2 * SHOULDER_WIDTH
             begin = np.where(gap > 1, far, near)
             starts.append(np.stack((begin, right + 0 * begin), axis=-1))
@@ -237,7 +258,7 @@ class Roadside:
         return _steel(start, end, 0 * s, s)
 
     def _widening(self, x: Array) -> Array:
-        """How far a ramp's right edge lies beyond the road's own."""
+        """Distance of the right edge of a ramp from that of the road [m]."""
         return np.asarray(self.shape.ramp(x)[1]) - self.shape.right_edge
 
 
@@ -258,12 +279,12 @@ def _steel(start: Array, end: Array, s_start: Array, s_end: Array) -> Faces:
 
 def vehicle_faces(poses: Array, sizes: Array, order: IntArray, front: int = FRONT) -> Faces:
     """
-    The four sides of vehicles.
+    Return the four sides of vehicles.
 
-    :param poses: Traffic, (instants, vehicles, 3): x, y, heading.
-    :param sizes: (vehicles, 2): length, width.
-    :param order: (instants, shown): the vehicles to show at each instant, far to near.
-    :param front: Kind of their front faces.
+    :param poses: x [m], y [m] and heading [rad] of the traffic, (instants, vehicles, 3).
+    :param sizes: Length and width in metres, (vehicles, 2).
+    :param order: Vehicles to show at each instant, far to near, (instants, shown).
+    :param front: Kind of the front faces.
     """
     pose, half = poses[np.arange(len(poses))[:, None], order], 0.5 * sizes[order]
     ahead = np.stack((np.cos(pose[..., 2]), np.sin(pose[..., 2])), axis=-1)

@@ -1,10 +1,11 @@
-"""The other vehicles: IDM/MOBIL drivers in a window that moves with the ego vehicle.
+"""
+The other vehicles: IDM/MOBIL drivers in a window that moves with the ego vehicle.
 
-The window reaches from :data:`BEHIND` to :data:`AHEAD`. Who leaves it at one end comes back at the other, in a random
-lane with a random speed, so the ego vehicle never runs out of traffic and the density stays what it was. Both ends
-are out of sight: the camera looks forward and draws cars up to 205 m. Oncoming vehicles leave at the rear and come back
-at the front. Where a ramp begins, out of sight, half of those who arrive do so on the ramp, slowly enough for the ego
-vehicle to catch up with them where they join the road.
+The window reaches from :data:`BEHIND` to :data:`AHEAD`. A vehicle that leaves it at one end returns at the other, in a
+random lane with a random speed, so that the density of the traffic does not change. Both ends are out of sight: the
+camera looks forward and draws cars up to 205 m away. Oncoming vehicles leave at the rear and return at the front. Where
+a ramp begins out of sight, half of the vehicles return on the ramp, slowly enough for the ego vehicle to catch up with
+them where they join the road.
 """
 
 from __future__ import annotations
@@ -19,35 +20,37 @@ from sb3_have.envs.merging import MergingDriver
 from sb3_have.envs.road import ROAD_LENGTH
 from sb3_have.envs.road_shape import RAMP_JOINS
 
+# Vehicles appear at least this far ahead of the ego vehicle [m]
 SIGHT = 300.0
-"""No vehicle appears nearer than this ahead of the ego vehicle [m]."""
+# Front end of the window, ahead of the ego vehicle [m]; vehicles appear in its last 20 m
 AHEAD = SIGHT + 20.0
-"""Front end of the window, ahead of the ego vehicle [m]; arrivals are spread over the last 20 m."""
+# Rear end of the window, behind the ego vehicle [m]; vehicles appear in its last 20 m
 BEHIND = 120.0
-"""Rear end of the window, behind the ego vehicle [m]; arrivals are spread over the last 20 m."""
+# Range of speeds on ramps [m/s]
 RAMP_SPEED = (10.0, 13.0)
-"""Range of speeds at which ramps are driven [m/s]."""
+# While a ramp begins out of sight ahead, vehicles farther behind than this [m] and no faster than the ego vehicle are
+# moved there
 BEHIND_RAMP = 40.0
-"""While a ramp begins out of sight ahead, who is farther behind [m] and too slow to come nearer is needed there."""
+# Vehicles appear on a ramp within this distance from its beginning [m]
 RAMP_ENTRY = 100.0
-"""Who arrives on a ramp arrives within this distance from its beginning [m]."""
 
 
 def populate(
     road: Road, ego: Vehicle, count: int, speeds: tuple[float, float], rng: np.random.Generator, tries: int = 100
 ) -> None:
-    """Add ``count`` vehicles to the road, uniformly over the window, with room to everyone around.
+    """
+    Add vehicles to the road, uniformly over the window and with room around each.
 
-    Room means that nobody starts nearer to the one in front than the gap IDM itself wants, at the speeds of both; for
-    an ego vehicle at rest that leaves followers in its lane about 120 m to stop. On a road too full for that the
-    rest queues ahead of the window and comes in through its rear end when there is room.
+    Each vehicle starts at least as far from the one in front as the gap that IDM wants at the speeds of both. Followers
+    in the lane of an ego vehicle at rest thus have about 120 m to stop. If the road is too full, the remaining vehicles
+    queue ahead of the window and enter through its rear end when there is room.
 
-    :param road: holds the ego vehicle already
-    :param ego: the ego vehicle
-    :param count: number of vehicles to add
-    :param speeds: range of the speeds they want to drive at [m/s]
-    :param rng: source of all randomness
-    :param tries: how often a place is drawn for each vehicle
+    :param road: Road that already holds the ego vehicle.
+    :param ego: Ego vehicle.
+    :param count: Number of vehicles to add.
+    :param speeds: Range of the desired speeds in m/s.
+    :param rng: Random generator.
+    :param tries: Number of places to try for each vehicle.
     """
     for i in range(count):
         for _ in range(tries):
@@ -63,13 +66,14 @@ def populate(
 
 
 def recycle(road: Road, ego: Vehicle, speeds: tuple[float, float], rng: np.random.Generator) -> list[int]:
-    """Bring vehicles that left the window at one end back at the other, where there is room; the rest waits.
+    """
+    Return vehicles that left the window to its other end where there is room; the others wait.
 
-    :param road: its ``vehicles`` keep their order, a recycled one is replaced in place
-    :param ego: the ego vehicle, never recycled
-    :param speeds: range of the speeds they want to drive at [m/s]
-    :param rng: source of all randomness
-    :return: indices into ``road.vehicles`` of the vehicles that were replaced
+    :param road: Road, whose ``vehicles`` keep their order: vehicles are replaced in place.
+    :param ego: Ego vehicle.
+    :param speeds: Range of the desired speeds in m/s.
+    :param rng: Random generator.
+    :return: Indices into ``road.vehicles`` of the replaced vehicles.
     """
     replaced = []
     called = _on_ramp(road, ego.position[0] + SIGHT, RAMP_ENTRY)
@@ -86,18 +90,19 @@ def recycle(road: Road, ego: Vehicle, speeds: tuple[float, float], rng: np.rando
         if _has_room(newcomer):
             road.vehicles[i] = newcomer
             replaced.append(i)
-            called = called and not needed  # one at a time
+            # Move one vehicle at a time to a ramp
+            called = called and not needed
     return replaced
 
 
 def _lanes(road: Road, direction: tuple[str, str]) -> list[LaneIndex]:
-    """The lanes of a direction, without ramps."""
+    """Lanes of a direction, without ramps."""
     lanes = road.network.graph.get(direction[0], {}).get(direction[1], [])
     return [(*direction, i) for i, lane in enumerate(lanes) if not lane.forbidden]
 
 
 def _open_lanes(road: Road, x: float, ramp_until: float) -> list[LaneIndex]:
-    """Lanes towards +x to draw from: those of the road, and as often a ramp, if x lies in its first metres."""
+    """Lanes towards +x to draw from. If x lies in the first metres of a ramp, half of them are the ramp."""
     lanes = _lanes(road, FORWARD)
     return lanes + [(*FORWARD, len(lanes))] * len(lanes) if _on_ramp(road, x, ramp_until) else lanes
 
@@ -126,9 +131,10 @@ def _random_vehicle(
 
 
 def _has_room(vehicle: Driver) -> bool:
-    """Whether all gaps in the vehicle's lane are what IDM wants (and never under two car lengths).
+    """
+    Check whether all gaps in the vehicle's lane are at least those that IDM wants, and at least two car lengths.
 
-    Who is changing into the lane counts as being there: MOBIL does not look again after it has decided.
+    Vehicles that are changing into the lane count as being there, because MOBIL does not reconsider its decisions.
     """
     for other in vehicle.road.vehicles:
         changing_in = getattr(other, "target_lane_index", None) == vehicle.lane_index

@@ -1,4 +1,4 @@
-"""The sensors of a car: poses in, the observation of a colour camera, an event camera and a depth camera out."""
+"""The colour, event and depth camera of a car: poses in, observation out."""
 
 from __future__ import annotations
 
@@ -29,7 +29,6 @@ from sb3_have.sensors.representations import (
 Observation = dict[str, NDArray[np.uint8]]
 
 MODALITIES: Final = ("rgb", "event", "depth")
-#: Defaults of the event camera. ``log_eps`` lies far below the light of a night, where noon is about 1.
 EVENT_DEFAULTS: Final[Mapping[str, Any]] = {
     "bins": 5,
     "subframes": 5,
@@ -46,6 +45,7 @@ EVENT_DEFAULTS: Final[Mapping[str, Any]] = {
     "tau": None,
     "seed": 0,
 }
+"""Default event camera. ``log_eps`` is far below the light at night; light at noon is about 1."""
 DEPTH_DEFAULTS: Final[Mapping[str, Any]] = {"encoding": "log", "max": 100.0}
 
 
@@ -53,21 +53,21 @@ class VisionSensors:
     """
     Roof camera, event camera and depth camera of the ego vehicle.
 
-    Only what the chosen modalities need is computed: an event camera needs several instants of each control step, the
-    others only the last.
+    Only what the chosen modalities need is computed: the event camera needs several instants of each control step, the
+    other cameras only the last one.
 
-    :param image_size: Rows and columns of every image.
+    :param image_size: Rows and columns of every image in pixels, at least 16.
     :param modalities: Non-empty subset of ``"rgb"``, ``"event"``, ``"depth"``.
-    :param event: Overrides of :data:`EVENT_DEFAULTS`: ``bins``, ``subframes`` (instants rendered per control step),
-        ``representation`` and, for a time surface, ``tau`` as :func:`~sb3_have.sensors.represent` has them (of the
-        events of one control step, whatever ``tau``), and the parameters of :class:`~sb3_have.sensors.EventCamera`.
-        ``seed`` fixes the chip's threshold mismatch; all noise comes from the generators given to :meth:`reset` and
+    :param event: Overrides of :data:`EVENT_DEFAULTS`: ``bins`` per control step, ``subframes`` (instants rendered per
+        control step), ``representation`` and ``tau`` in seconds as in :func:`~sb3_have.sensors.represent` (always of
+        the events of one control step), and the parameters of :class:`~sb3_have.sensors.EventCamera`. ``seed`` fixes
+        the threshold mismatch of the chip; all noise comes from the generators passed to :meth:`reset` and
         :meth:`observe`. With a ``mapping`` other than "log" the event camera sees the digital numbers of the colour
         camera, neither clipped nor rounded.
-    :param depth: Overrides of :data:`DEPTH_DEFAULTS`: ``encoding`` ("log", "clipped", "inverse") and, for the latter
-        two, ``max`` in metres.
-    :param shape: Of the road, as :func:`~sb3_have.envs.road_shape.road_shape` has them; 4 straight lanes by default.
-    :raises ValueError: on an unknown modality, option or value.
+    :param depth: Overrides of :data:`DEPTH_DEFAULTS`: ``encoding`` ("log", "clipped" or "inverse") and, except for
+        "log", the maximum ``max`` in metres.
+    :param shape: Shape of the road, see :func:`~sb3_have.envs.road_shape.road_shape`; by default 4 straight lanes.
+    :raises ValueError: If a modality, an option or a value is unknown or out of range.
     """
 
     def __init__(
@@ -91,20 +91,20 @@ class VisionSensors:
         for name in ("bins", "subframes"):
             check_whole(f"event {name}", chip[name], 1)
         self.bins, self.subframes = int(chip.pop("bins")), int(chip.pop("subframes"))
-        #: What the event image shows, see :func:`~sb3_have.sensors.represent`.
+        # Representation of the event image
         self.representation: Representation = chip.pop("representation")
         self._tau = chip.pop("tau")
         event_channels = channels(self.representation, self.bins)
-        self._represent(np.empty(0, np.int64), np.empty(0), np.empty(0), 0.0, 1.0)  # complains about a wrong tau now
+        self._represent(np.empty(0, np.int64), np.empty(0), np.empty(0), 0.0, 1.0)  # check tau now
         self.event_camera = EventCamera(image_size, image_size, **chip)
 
         depths = {"rgb": 3, "event": event_channels, "depth": 1}
-        #: Space of each modality: uint8 (image_size, image_size, channels).
+        # Space of each modality: uint8 (image_size, image_size, channels)
         self.spaces: dict[str, spaces.Box] = {
             name: spaces.Box(0, 255, (image_size, image_size, depths[name]), np.uint8) for name in self.modalities
         }
         self._sizes: Array = np.empty((0, 2))
-        self._view: Objects | None = None
+        self._view: Objects
         self._time = 0.0
 
     def reset(self, weather: str, poses: Array, sizes: Array, rng: np.random.Generator) -> Observation:
@@ -112,17 +112,14 @@ class VisionSensors:
         Start an episode.
 
         :param weather: One of :data:`~sb3_have.envs.weather.WEATHERS`.
-        :param poses: (1 + vehicles, 3): x, y in metres and heading in radians; row 0 is the ego.
-        :param sizes: (1 + vehicles, 2): length and width in metres, for the whole episode.
-        :param rng: Source of the vehicles' paints and of the noise.
-        :return: An image per modality; the event image is empty (all 128).
-        :raises ValueError: on an unknown weather or wrong shapes.
+        :param poses: x [m], y [m] and heading [rad], (1 + vehicles, 3); row 0 is the ego vehicle.
+        :param sizes: Length and width in metres for the whole episode, (1 + vehicles, 2).
+        :param rng: Generator of the vehicles' paints and of the noise.
+        :return: Image of each modality; the event image is empty (all 128).
+        :raises ValueError: If the weather is unknown, or if the poses and sizes do not match.
         """
         self.weather = weather_by_name(weather)
-        sizes = np.asarray(sizes, dtype=np.float64)
-        if sizes.ndim != 2 or sizes.shape[1] != 2 or len(sizes) < 1:
-            raise ValueError(f"sizes must have shape (1 + vehicles, 2), got {sizes.shape}")
-        self._sizes = sizes
+        self._sizes = sizes = np.asarray(sizes, dtype=np.float64)
         poses = self._check(np.asarray(poses)[None])
         paint = rng.integers(len(PAINTS), size=len(sizes) - 1)
         self._colour = Illumination(self.weather, self.camera, paint, colour=True)
@@ -133,19 +130,16 @@ class VisionSensors:
 
     def observe(self, poses: Array, duration: float, rng: np.random.Generator) -> Observation:
         """
-        What the sensors deliver at the end of a control step.
+        Return the images at the end of a control step.
 
-        :param poses: (instants, 1 + vehicles, 3), two or more equally spaced instants of the step; the first is its
-            start, the last is now. Vehicles keep their row through the episode.
-        :param duration: Length of the step in seconds.
-        :param rng: Source of the noise.
-        :return: An image per modality.
-        :raises ValueError: on wrong shapes or a duration that is not positive.
-        :raises RuntimeError: before the first :meth:`reset`.
+        :param poses: Poses at two or more equally spaced instants from the start to the end of the step, (instants,
+            1 + vehicles, 3). Vehicles keep their row during the episode.
+        :param duration: Duration of the step in seconds.
+        :param rng: Generator of the noise.
+        :return: Image of each modality.
+        :raises ValueError: If the number of vehicles is not that of the reset.
         """
         poses = self._check(np.asarray(poses))
-        if len(poses) < 2 or not duration > 0:
-            raise ValueError(f"need at least 2 instants and a positive duration, got {len(poses)} and {duration}")
         if "event" in self.modalities:
             at = np.arange(1, self.subframes + 1) * (len(poses) - 1) / self.subframes  # ends exactly on the last
             before = np.minimum(at.astype(int), len(poses) - 2)
@@ -158,11 +152,11 @@ class VisionSensors:
     @property
     def last_truth(self) -> dict[str, NDArray[Any]]:
         """
-        What the last observation was made from, (image_size, image_size) each: ``depth`` (float32 metres, infinite in
-        the sky) and ``vehicle``, the traffic vehicle that a pixel sees (its row in the poses less one) or -1.
+        Ground truth of the last observation, (image_size, image_size) each.
+
+        ``depth`` is in float32 metres, infinite in the sky; ``vehicle`` is the number of the vehicle that a pixel sees
+        (its row in the poses minus one), or -1.
         """
-        if self._view is None:
-            raise RuntimeError("no observation yet: call reset() first")
         last = self._view
         far_to_near = np.argsort(-last.depth, kind="stable")
         vehicle = np.full(self.image_size**2, -1)
@@ -173,8 +167,6 @@ class VisionSensors:
         }
 
     def _check(self, poses: Array) -> Array:
-        if not len(self._sizes):
-            raise RuntimeError("call reset() before observe()")
         poses = np.asarray(poses, dtype=np.float64)
         if poses.ndim != 3 or poses.shape[1:] != (len(self._sizes), 3):
             raise ValueError(f"poses must have shape (..., {len(self._sizes)}, 3) as at reset, got {poses.shape[-2:]}")
@@ -183,7 +175,7 @@ class VisionSensors:
     def _sense(self, poses: Array, duration: float, rng: np.random.Generator) -> Observation:
         objects = self.camera.objects(poses, self._sizes)
         self._view = last = objects.last(len(poses), self.image_size**2)
-        # A seed each, always drawn: the noise of one sensor does not depend on which others there are.
+        # Always draw a seed for each sensor, so that its noise does not depend on the other modalities
         picture_seed, event_seed = rng.integers(2**63, size=2)
         observation: Observation = {}
         if "rgb" in self.modalities or "event" in self.modalities:
@@ -200,7 +192,7 @@ class VisionSensors:
         return observation
 
     def _events(self, frames: Array, duration: float, rng: np.random.Generator) -> NDArray[np.uint8]:
-        """Event image of the brightness frames of one step; at reset (duration 0) there is one frame and no event."""
+        """Event image of the brightness frames of one step. At a reset (duration 0) there is one frame and no event."""
         if self.event_options["mapping"] != "log":
             frames = frames * (255 * self.weather.exposure)
         size, start = self.image_size, self._time
@@ -229,17 +221,17 @@ class VisionSensors:
 
 def depth_options(given: Mapping[str, Any] | None) -> dict[str, Any]:
     """
-    :data:`DEPTH_DEFAULTS` with overrides.
+    Return :data:`DEPTH_DEFAULTS` with overrides.
 
-    :param given: ``encoding`` and, where it has one, ``max``.
-    :raises ValueError: on an unknown option, or a value that it cannot have.
+    :param given: ``encoding`` and, except for "log", ``max`` in metres.
+    :raises ValueError: If an option is unknown, out of range or without effect.
     """
     options = _options("depth", DEPTH_DEFAULTS, given)
-    encode_depth(np.empty(0), *options.values())  # complains about a wrong option now, not at reset
+    encode_depth(np.empty(0), *options.values())  # check the values now
     if options["encoding"] == "log" and "max" in (given or {}):
         raise ValueError(
-            f"depth max={options['max']!r} has no effect with encoding 'log', whose range is fixed; leave it out or "
-            "choose encoding 'clipped' or 'inverse'"
+            f"depth max={options['max']!r} has no effect with encoding 'log', which has a fixed range; leave it out "
+            "or choose encoding 'clipped' or 'inverse'"
         )
     return options
 
@@ -255,13 +247,16 @@ def compose(
     observation: Mapping[str, NDArray[np.uint8]], scale: int = 4, representation: Representation = "sbt"
 ) -> NDArray[np.uint8]:
     """
-    One picture of an observation, RGB | event | depth from left to right, for people to look at.
+    Compose a picture of an observation for people, with RGB, events and depth from left to right.
 
-    :param observation: Any non-empty subset of the modalities, (H, W, C) uint8 each.
-    :param scale: Pixels on the screen per pixel of the image.
-    :param representation: Of the events.
-    :return: uint8 (H * scale, W * scale * modalities, 3). Events: red brighter, blue darker, on white. Depth:
-        near yellow, far violet, no data black.
+    Brighter events are red and darker ones blue, on white. Depth goes from yellow (near) to violet (far), black where
+    there is nothing.
+
+    :param observation: Any non-empty subset of the modalities, uint8 (H, W, C) each.
+    :param scale: Size of a pixel in the picture.
+    :param representation: Representation of the events.
+    :return: uint8 (H * scale, W * scale * modalities, 3).
+    :raises ValueError: If the observation has none of the modalities.
     """
     shown = [_paint(name, np.asarray(observation[name]), representation) for name in MODALITIES if name in observation]
     if not shown:

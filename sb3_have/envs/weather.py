@@ -1,8 +1,9 @@
-"""Eight weathers: how much light falls on a scene, what the air does to it, and how a colour camera takes it.
+"""
+Eight weathers: the light on a scene, its way through the air, and its capture by a colour camera.
 
-Light is linear and unclipped, in units in which a white surface under a clear noon sky has irradiance 1. A night lies
-three to four orders of magnitude lower. The colour camera has to choose an exposure and clips and quantises; an event
-camera works on the logarithm and hardly notices.
+Light is linear and not clipped, in units in which a white surface under a clear noon sky has irradiance 1. Nights are
+three to four orders of magnitude darker. The colour camera needs an exposure, clips and quantises; an event camera
+works on the logarithm and is hardly affected.
 """
 
 from __future__ import annotations
@@ -21,25 +22,25 @@ from sb3_have.envs.scene import ALBEDO, ASPHALT, HEADLAMP, LAMP, MARKING, PAINTS
 
 Colour = tuple[float, float, float]
 
-#: Weights of red, green and blue in the brightness that a monochrome (event) pixel sees.
+# Weights of red, green and blue in the brightness of a monochrome (event) pixel
 LUMA: Final = np.array((0.299, 0.587, 0.114), dtype=np.float32)
 
 
 @dataclass(frozen=True)
 class Weather:
     """
-    One weather.
+    A weather.
 
     :param sun: Irradiance from the sun (or moon) on a surface that faces it.
     :param ambient: Irradiance from the sky on a horizontal surface.
-    :param zenith: Radiance of the sky above.
+    :param zenith: Radiance of the sky at the zenith.
     :param horizon: Radiance of the sky at the horizon, and of fog.
-    :param exposure: Share of the colour camera's full well per unit of radiance. A night is exposed 40 times as long as
-        a clear noon, the most that a moving camera can afford, and stays dark.
-    :param wetness: 0 (dry) to 1 (standing water): the road darkens and mirrors the sky.
-    :param extinction: Share of light lost per metre to rain and mist.
-    :param rain: 0 (none) to 1 (hard): streaks in the colour image, false events.
-    :param night: The ego's headlights and everybody's tail lights are on.
+    :param exposure: Share of the colour camera's full well per unit of radiance. Nights are exposed 40 times as long as
+        a clear noon, the longest that a moving camera can afford, and stay dark.
+    :param wetness: 0 (dry) to 1 (standing water). A wet road is darker and mirrors the sky.
+    :param extinction: Share of the light lost to rain and mist per metre.
+    :param rain: 0 (none) to 1 (hard). Rain causes streaks in the colour image and false events.
+    :param night: Whether the ego vehicle's headlights and all tail lights are on.
     """
 
     sun: Colour
@@ -54,7 +55,7 @@ class Weather:
 
 
 def _night(level: float, warmth: float = 0.0) -> Colour:
-    """Faint light, bluish under a clear sky, warmer where clouds throw back the light of towns."""
+    """Faint light, bluish under a clear sky and warmer where clouds reflect the light of towns."""
     return (level * (0.75 + 0.45 * warmth), level * (0.9 + 0.1 * warmth), level * (1.25 - 0.45 * warmth))
 
 
@@ -129,14 +130,16 @@ _WEATHERS: Final = {
         extinction=0.001,
     ),
 }
-#: Names of the eight weathers, as in the paper.
 WEATHERS: Final[tuple[str, ...]] = tuple(_WEATHERS)
+"""Names of the eight weathers, as in the paper."""
 
 
 def weather_by_name(name: str) -> Weather:
     """
+    Return a weather.
+
     :param name: One of :data:`WEATHERS`.
-    :raises ValueError: on any other name.
+    :raises ValueError: If the name is unknown.
     """
     if name not in _WEATHERS:
         raise ValueError(f"unknown weather {name!r}; the weathers are {', '.join(WEATHERS)}")
@@ -145,10 +148,10 @@ def weather_by_name(name: str) -> Weather:
 
 def weather_choices(weather: str | Sequence[str]) -> tuple[str, ...]:
     """
-    The weathers that the option ``weather`` of an environment stands for.
+    Return the weathers to draw from, given the option ``weather`` of an environment.
 
-    :param weather: One of :data:`WEATHERS`, a list of such, or "random" for all of them.
-    :raises ValueError: on any other name, and on none.
+    :param weather: One of :data:`WEATHERS`, a list of them, or "random" for all.
+    :raises ValueError: If a name is unknown or the list is empty.
     """
     if isinstance(weather, str) and weather == "random":
         return WEATHERS
@@ -159,31 +162,31 @@ def weather_choices(weather: str | Sequence[str]) -> tuple[str, ...]:
     return choices
 
 
-#: Unit vector towards the sun (forward, right, up): high, behind the ego and to its left, so rear faces are lit.
+# Unit vector towards the sun (forward, right, up). It is high and behind the ego vehicle, so that rear faces are lit.
 SUN_DIRECTION: Final = np.array((-0.45, -0.30, 0.84))
-#: Share of the sky's light that reaches a vertical face.
+# Share of the sky's light that reaches a vertical face
 SKY_ON_WALLS: Final = 0.55
-#: Low beam: irradiance next to the lamp, reach in metres (nothing is left of it at 30 m), tan of its half-width.
+# Low beam: irradiance at the lamp, reach [m] (nothing is left at 30 m), tangent of its half-width
 HEADLIGHT: Final = 0.08
 HEADLIGHT_COLOUR: Final[Colour] = (1.0, 0.94, 0.80)
 HEADLIGHT_REACH: Final = 13.0
 HEADLIGHT_WIDTH: Final = 0.28
-#: Radiance of a tail light.
+# Radiance of a tail light
 TAIL_LIGHT: Final[Colour] = (6e-4, 4e-5, 3e-5)
-#: Radiance of an oncoming car's low beam, seen from outside of its cone.
+# Radiance of an oncoming low beam, seen from outside its cone
 LOW_BEAM: Final[Colour] = (2e-2, 1.9e-2, 1.6e-2)
-#: False events per pixel and second in the hardest rain.
+# False events per pixel and second in the hardest rain
 RAIN_EVENT_RATE: Final = 1.5
 
 
 class Illumination:
     """
-    A weather seen through a camera: all that does not depend on the vehicles, computed once per episode.
+    A weather seen by a camera. Whatever does not depend on the vehicles is computed once per episode.
 
-    :param weather: The weather.
-    :param camera: The camera.
+    :param weather: Weather.
+    :param camera: Camera.
     :param paint: Index into ``PAINTS`` of every traffic vehicle.
-    :param colour: True for red, green and blue; False for brightness alone.
+    :param colour: Whether to compute red, green and blue, or only brightness.
     """
 
     def __init__(self, weather: Weather, camera: Camera, paint: NDArray[np.int64], colour: bool) -> None:
@@ -196,12 +199,12 @@ class Illumination:
         self.asphalt, self.marking = self._light(ASPHALT) * wet, self._light(MARKING) * (0.5 + 0.5 * wet)
         self.verge = self._light(VERGE) * (0.5 + 0.5 * wet)
 
-        # Sky: darker or bluer towards the zenith.
+        # Sky: darker or bluer towards the zenith
         zenith = self._light(weather.zenith)
         up = np.clip(-camera.slope[: camera.horizon] / 0.6, 0, 1)[:, None] ** np.float32(0.7)
         self.sky = self.horizon[..., None] + up * (zenith - self.horizon)[..., None]
 
-        # Ground: light that falls on it, and the haze and the sky's mirror image that lie over it.
+        # Ground: incident light, and the haze and the reflection of the sky on top of it
         forward = camera.ground_forward
         haze = np.exp(-np.float32(weather.extinction) * forward)
         self.fog = self.horizon[..., None] * (1 - haze)
@@ -213,22 +216,22 @@ class Illumination:
         self.mirror = self.horizon[..., None] * mirror * haze * np.float32(0.6)
 
     def _light(self, value: Array | Colour) -> Array:
-        """Colour channels, or their brightness, along the first axis, which is as fast as numpy can loop: (C, n)."""
+        """Colour channels, or their brightness, along the first axis, on which NumPy is fastest: (C, n)."""
         channels = np.atleast_2d(np.asarray(value, dtype=np.float32))
         return np.ascontiguousarray(channels.T) if self.colour else (channels @ LUMA)[None]
 
     def _beam(self, forward: Array, tangent: Array) -> Array:
-        """Share of the headlights' light at a distance and tan(angle), on a surface facing them."""
+        """Share of the headlights' light on a surface facing them, by distance [m] and tangent of the angle."""
         reach = np.exp(-((forward / np.float32(HEADLIGHT_REACH)) ** 2)) / (1 + (forward / 6) ** 2)
         return np.asarray(reach * np.exp(-((tangent / np.float32(HEADLIGHT_WIDTH)) ** 2)))
 
     def render(self, ground: Ground, objects: Objects) -> Array:
         """
-        Irradiance of every pixel.
+        Compute the light that reaches every pixel.
 
-        :param ground: From :meth:`Camera.ground`.
-        :param objects: From :meth:`Camera.objects`, of the same instants.
-        :return: float32 (instants, height, width, 3 or 1), linear, >= 0, unclipped.
+        :param ground: Ground from :meth:`Camera.ground`.
+        :param objects: Objects from :meth:`Camera.objects` at the same instants.
+        :return: Linear light >= 0, not clipped, float32 (instants, height, width, 3 or 1).
         """
         camera = self.camera
         size, horizon = camera.size, camera.horizon
@@ -263,12 +266,13 @@ class Illumination:
         radiance = self.albedo.take(objects.material, axis=1) * received
         if self.weather.night:
             radiance[:, np.flatnonzero(objects.material == LAMP)] += self.tail
-            if self.camera.shape.oncoming:  # or there are none, and no need to search the samples for them
+            # Only oncoming cars show their headlights
+            if self.camera.shape.oncoming:
                 radiance[:, np.flatnonzero(objects.material == HEADLAMP)] += self.head
         return np.asarray(radiance * haze + self.horizon * (1 - haze))
 
 
-#: The colour camera: electrons in a full pixel, read noise in electrons, steps of the converter.
+# Colour camera: electrons in a full pixel, read noise [electrons], steps of the converter, exponent of the gamma
 FULL_WELL: Final = 9000.0
 READ_NOISE: Final = 6.0
 ADC_STEPS: Final = 4095
@@ -278,11 +282,11 @@ _GAMMA_TABLE: Final = np.rint(255 * (np.arange(ADC_STEPS + 1) / ADC_STEPS) ** (1
 
 def take_picture(radiance: Array, weather: Weather, rng: np.random.Generator) -> NDArray[np.uint8]:
     """
-    The colour camera: fixed exposure, photon and read noise, 12-bit conversion, gamma, 8 bits; rain streaks.
+    Take a picture with the colour camera: exposure, photon and read noise, 12-bit conversion, gamma, rain streaks.
 
-    :param radiance: float32 (height, width, 3), linear.
-    :param weather: The weather, for exposure and rain.
-    :param rng: Source of the noise.
+    :param radiance: Linear light, float32 (height, width, 3).
+    :param weather: Weather, for exposure and rain.
+    :param rng: Generator of the noise.
     :return: uint8 (height, width, 3).
     """
     if weather.rain:
@@ -298,7 +302,7 @@ def take_picture(radiance: Array, weather: Weather, rng: np.random.Generator) ->
 
 
 def _streaks(size: int, weather: Weather, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Falling drops, blurred by the exposure into faint lines: brightness added, as a share of the mean."""
+    """Faint lines of falling drops, blurred by the exposure: added brightness as a share of the mean."""
     streaks = np.zeros((size, size), dtype=np.float32)
     count = rng.poisson(0.5 * size * weather.rain)
     start = rng.uniform(0, size, (count, 2))
@@ -316,12 +320,15 @@ def rain_events(
     weather: Weather, t0: float, t1: float, height: int, width: int, rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """
-    False events of drops that cross the view within milliseconds: short vertical runs of one polarity.
+    Draw the false events of drops that cross the view within milliseconds, short vertical runs of one polarity.
 
-    :param weather: The weather; no rain, no events.
+    :param weather: Weather; without rain there are no events.
     :param t0: Start of the interval in seconds.
     :param t1: End of the interval in seconds.
-    :return: Pixel index, time and polarity, as :meth:`EventCamera.detect` returns them.
+    :param height: Rows of the camera in pixels.
+    :param width: Columns of the camera in pixels.
+    :param rng: Generator of the drops.
+    :return: Pixel index, time in seconds and polarity, as :meth:`EventCamera.detect` returns them.
     """
     run = max(2, height // 24)
     rate = weather.rain * RAIN_EVENT_RATE * (height + run - 1) * width / run
@@ -329,7 +336,7 @@ def rain_events(
     column = rng.integers(width, size=drops)
     row = rng.integers(1 - run, height, size=drops)
     time = rng.uniform(t0, t1, drops)
-    # A drop is a lens that shows the sky: it brightens more often than it darkens.
+    # A drop is a lens that shows the sky, so it brightens more often than it darkens
     polarity = np.where(rng.random(drops) < 0.65, 1.0, -1.0)
     rows = row[:, None] + np.arange(run)
     inside = (rows >= 0) & (rows < height)

@@ -1,11 +1,15 @@
-"""Simulated sensors and the 8-bit forms in which their images travel."""
+"""
+Sensors for any Gymnasium environment: simulated cameras, recorded events, and sensor failures.
+
+What belongs here turns frames, depth or files into observations, or corrupts them. Scenes and driving belong to
+:mod:`sb3_have.envs`, and networks to :mod:`sb3_have.common`.
+"""
 
 from sb3_have.sensors.depth import decode_depth, depth_from_zbuffer, disparity_noise, encode_depth
 from sb3_have.sensors.depth_observation import DepthObservation
 from sb3_have.sensors.event_camera import EVENT_DTYPE, PRESETS, EventCamera
 from sb3_have.sensors.event_files import EventFile, read_events
 from sb3_have.sensors.event_observation import EventObservation
-from sb3_have.sensors.event_writer import EventWriter, write_events
 from sb3_have.sensors.failures import FAILURES, SENSORS, failures_for
 from sb3_have.sensors.rendering import RenderObservation
 from sb3_have.sensors.representations import (
@@ -21,7 +25,7 @@ from sb3_have.sensors.representations import (
     voxel_grid,
 )
 from sb3_have.sensors.sensor_failure import SensorFailure
-from sb3_have.sensors.wrappers import ChannelLastImages, DictObservation, SelectModalities
+from sb3_have.sensors.wrappers import ChannelLastImages, DictObservation
 
 __all__ = [
     "EVENT_DTYPE",
@@ -34,10 +38,8 @@ __all__ = [
     "EventCamera",
     "EventFile",
     "EventObservation",
-    "EventWriter",
     "RenderObservation",
     "Representation",
-    "SelectModalities",
     "SensorFailure",
     "channels",
     "count_frames",
@@ -54,5 +56,4 @@ __all__ = [
     "stack_by_time",
     "time_surface",
     "voxel_grid",
-    "write_events",
 ]

@@ -1,4 +1,4 @@
-"""Checks of options and observations, with errors that name them. Nothing here depends on an environment."""
+"""Checks of options, shared by the sensors and the environments."""
 
 from __future__ import annotations
 
@@ -10,28 +10,30 @@ import numpy as np
 
 
 def is_number(value: Any, kind: type = Real) -> bool:
-    """Whether this is one number of Python or numpy, a whole one with ``kind=Integral``; a bool is not."""
+    """Check for a single number of Python or NumPy, not a bool; with ``kind=Integral`` for a whole number."""
     return isinstance(value, kind) and not isinstance(value, bool)
 
 
 def is_finite(value: Any) -> bool:
-    """Whether this is one number of Python or numpy, neither infinite nor NaN; a bool is not."""
+    """Check for a single number that is neither infinite nor NaN."""
     return is_number(value) and bool(-np.inf < value < np.inf)
 
 
 def is_pair(value: Any) -> bool:
-    """Whether these are two finite numbers in a tuple, list or array."""
+    """Check for two finite numbers in a tuple, list or array."""
     parts = value.tolist() if isinstance(value, np.ndarray) else value
     return isinstance(parts, tuple | list) and len(parts) == 2 and all(map(is_finite, parts))
 
 
 def check_whole(name: str, value: Any, least: int, most: int | None = None) -> None:
     """
-    :param name: Of the option, for the message.
-    :param value: What was given.
-    :param least: Smallest value.
-    :param most: Greatest value, if there is one.
-    :raises ValueError: unless it is a whole number of Python or numpy in these bounds.
+    Check an option that must be a whole number.
+
+    :param name: Name of the option, for the message.
+    :param value: Value of the option.
+    :param least: Smallest value allowed.
+    :param most: Largest value allowed, if any.
+    :raises ValueError: If the value is not a whole number in this range.
     """
     if not is_number(value, Integral) or value < least or (most is not None and value > most):
         bounds = f">= {least}" if most is None else f"in {least}..{most}"
@@ -40,28 +42,29 @@ def check_whole(name: str, value: Any, least: int, most: int | None = None) -> N
 
 def positive_pair(name: str, value: Any) -> tuple[float, float]:
     """
-    One positive number, twice, or a pair of them.
+    Return a positive number twice, or a pair of positive numbers as it is.
 
-    :param name: Of the option, for the message.
-    :param value: What was given.
-    :raises ValueError: if it is neither.
+    :param name: Name of the option, for the message.
+    :param value: Value of the option.
+    :raises ValueError: If the value is neither.
     """
     pair = value if is_pair(value) else (value, value)
     if not all(is_finite(part) and part > 0 for part in pair):
-        raise ValueError(f"{name} must be one positive number or a pair (positive, negative), got {value!r}")
+        raise ValueError(f"{name} must be a positive number or a pair (positive, negative), got {value!r}")
     return float(pair[0]), float(pair[1])
 
 
 def describe(value: Any) -> str:
-    """Dtype and shape of an array, the type of anything else."""
+    """Describe a value in an error message: dtype and shape of an array, or the type."""
     return f"{value.dtype} {value.shape}" if isinstance(value, np.ndarray) else type(value).__name__
 
 
 def parse_size(image_size: int | Sequence[int] | None) -> tuple[int, int] | None:
     """
-    (rows, columns) of one number or a pair.
+    Return the (rows, columns) of an option ``image_size``.
 
-    :raises ValueError: unless these are whole numbers of at least 1.
+    :param image_size: One number for both, a pair, or None.
+    :raises ValueError: If these are not whole numbers >= 1.
     """
     if image_size is None:
         return None
@@ -73,8 +76,13 @@ def parse_size(image_size: int | Sequence[int] | None) -> tuple[int, int] | None
 
 def pick(available: Mapping[str, Any], key: str, wrapper: str) -> Any:
     """
-    :raises KeyError: if there is no such key; lists those there are.
+    Return the space of an observation key.
+
+    :param available: Spaces by key.
+    :param key: Key to look up.
+    :param wrapper: Name of the wrapper, for the message.
+    :raises KeyError: If there is no such key; the message lists the keys.
     """
     if key not in available:
-        raise KeyError(f"{wrapper}: the observation has no key {key!r}, only {list(available)}; name one of them")
+        raise KeyError(f"{wrapper}: the observation has no key {key!r}, only {list(available)}")
     return available[key]

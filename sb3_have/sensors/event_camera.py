@@ -1,13 +1,14 @@
-"""An event camera: brightness frames in, asynchronous signed events out.
+"""
+A simulated event camera: it takes frames of intensity and returns asynchronous signed events.
 
-Every pixel remembers a reference level of log brightness. Whenever the brightness has moved away from it by one
-contrast threshold the pixel fires an event, and the reference moves by that threshold. Between two frames the
-brightness is taken as linear in time, so a fast change gives several events, each with its own time stamp
-(Rebecq et al., "ESIM: an Open Event Camera Simulator", CoRL 2018). Noise follows Hu et al., "v2e: From Video
-Frames to Realistic DVS Events", CVPRW 2021.
+Each pixel remembers a reference level of log brightness. Whenever the brightness has moved away from it by one contrast
+threshold, the pixel fires an event and the reference moves by that threshold. Between two frames the brightness is
+linear in time, so a fast change gives several events, each with its own time stamp (Rebecq et al., "ESIM: an Open Event
+Camera Simulator", CoRL 2018). The noise follows Hu et al., "v2e: From Video Frames to Realistic DVS Events",
+CVPRW 2021.
 
-From one frame to the next, in this order: the mapped intensity, the low-pass filter of the photoreceptor, the leak,
-the crossings of the straight line between the two levels, shot noise, the refractory period.
+Each frame passes these stages in order: mapping of the intensity, low-pass filter of the photoreceptor, leak, threshold
+crossings on the straight line between the two levels, shot noise, refractory period.
 """
 
 from __future__ import annotations
@@ -23,22 +24,15 @@ from sb3_have.sensors.checks import check_whole, is_finite, positive_pair
 
 Mapping = Literal["log", "lin_log", "identity"]
 
-#: One event: column, row, time in seconds, polarity +1 (brighter) or -1 (darker). Environments count in seconds, and in
-#: float64 neighbouring times lie less than a nanosecond apart for the first 97 days; files of recorded events count in
-#: whole micro- or nanoseconds.
 EVENT_DTYPE = np.dtype([("x", np.uint16), ("y", np.uint16), ("t", np.float64), ("p", np.int8)])
+"""
+An event: column x and row y in pixels, time t in seconds, polarity p +1 (brighter) or -1 (darker). Neighbouring float64
+times lie less than a nanosecond apart for the first 97 days.
+"""
 
-#: v2e's lin-log mapping is linear below this many digital numbers, where the noise of an 8-bit frame is one threshold.
+# v2e's lin-log mapping is linear below this digital number, where the noise of an 8-bit frame is one threshold
 LIN_LOG_KNEE = 20.0
 
-#: Parameters of :class:`EventCamera` by name, for :meth:`EventCamera.preset`.
-#:
-#: - ``"ideal"``: no noise, no mismatch. Frames of linear light, white at about 1.
-#: - ``"carla"``: the defaults of CARLA 0.9.16's ``sensor.camera.dvs`` (its reference of sensors). Frames as there, the
-#:   8-bit grey image over 255 with grey = 0.2989 R + 0.5870 G + 0.1140 B. Time stamps are those of this module.
-#: - ``"noisy"``: v2e's option ``--dvs_params noisy``. Frames in digital numbers 0..255. Other than in v2e, shot noise
-#:   does not depend on the light, leaks have no jitter, and the bandwidth is the same in the dark unless
-#:   ``cutoff_intensity=255`` is added.
 PRESETS: Final[abc.Mapping[str, abc.Mapping[str, Any]]] = MappingProxyType(
     {
         "ideal": MappingProxyType({"threshold": 0.2, "mapping": "log", "log_eps": 1e-3}),
@@ -55,39 +49,49 @@ PRESETS: Final[abc.Mapping[str, abc.Mapping[str, Any]]] = MappingProxyType(
         ),
     }
 )
+"""
+Parameters of :class:`EventCamera` by name, for :meth:`EventCamera.preset`.
+
+- ``"ideal"``: no noise, no mismatch. Expects frames of linear light with white at about 1.
+- ``"carla"``: the defaults of ``sensor.camera.dvs`` in CARLA 0.9.16. Expects the 8-bit grey image divided by 255, with
+  grey = 0.2989 R + 0.5870 G + 0.1140 B. The time stamps are those of this module.
+- ``"noisy"``: v2e's option ``--dvs_params noisy``. Expects frames in digital numbers 0..255. Unlike in v2e, shot noise
+  does not depend on the light, leaks have no jitter, and the bandwidth does not shrink in the dark unless
+  ``cutoff_intensity=255`` is added.
+"""
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
-#: Events as three flat arrays: pixel index (row * width + column), time, polarity.
+# Events as three flat arrays: pixel index (row * width + column), time [s], polarity
 Events = tuple[IntArray, FloatArray, FloatArray]
 
 
 class EventCamera:
     """
-    Simulated event camera with exact multiple crossings per pixel and frame.
+    Simulated event camera that finds every threshold crossing between two frames.
 
-    :param height: Rows of the sensor.
-    :param width: Columns of the sensor.
+    :param height: Rows of the sensor in pixels.
+    :param width: Columns of the sensor in pixels.
     :param threshold: Contrast threshold C in units of the mapped intensity, one number or ``(positive, negative)``.
-        Of logarithms these are natural log units: 0.2 is a change by 22%.
-    :param threshold_sigma: Standard deviation of C over the pixels, in the same units. Drawn once per pixel: it is a
-        property of the chip. Draws are floored at a tenth of the nominal threshold.
-    :param refractory: Dead time of a pixel after an event, in seconds. A crossing in the dead time is lost, and the
-        reference moves all the same (as in ESIM).
-    :param leak_rate: Rate of spurious positive events per pixel, in Hz, from the drift of the reference. Every pixel
+        For the logarithmic mappings these are natural log units: 0.2 is a change by 22%.
+    :param threshold_sigma: Standard deviation of C over the pixels, in the same units. It is a property of the chip,
+        drawn once per pixel; draws are floored at a tenth of the nominal threshold.
+    :param refractory: Dead time of a pixel after an event in seconds. Crossings during the dead time are lost, but the
+        reference still moves (as in ESIM).
+    :param leak_rate: Rate of spurious positive events per pixel in Hz, caused by the drift of the reference. Each pixel
         leaks at its own phase, drawn once: at a reset its reference lies that share of a threshold below the level.
-    :param shot_rate: Rate of random events per pixel, in Hz, half of them positive. They leave the reference alone.
-    :param mapping: ``"log"``: log(log_eps + I); ``"lin_log"``: v2e's mapping of numbers 0..255, linear below 20;
-        ``"identity"``: the frame is taken as it is (it may already be a logarithm).
-    :param log_eps: Added to the intensity before the logarithm; it sets how dark the sensor still sees.
-    :param cutoff_hz: Bandwidth of the photoreceptor in Hz: its mapped intensity passes a low-pass filter of first
-        order, time constant 1 / (2 pi cutoff_hz), exact for an input that is linear in time between the frames. None
-        is an unlimited bandwidth.
-    :param cutoff_intensity: Intensity from which on the bandwidth is ``cutoff_hz``. In less light it shrinks in
-        proportion, to no less than a tenth, much as in v2e. The intensity is the new frame's, so how finely a film is
-        cut into frames then makes a small difference. None: the same bandwidth in any light.
+    :param shot_rate: Rate of random events per pixel in Hz, half of them positive. They do not move the reference.
+    :param mapping: ``"log"``: log(log_eps + I). ``"lin_log"``: v2e's mapping of digital numbers 0..255, linear below
+        20. ``"identity"``: the frame itself (which may already be a logarithm).
+    :param log_eps: Intensity added before the logarithm; it sets how dark the sensor can still see.
+    :param cutoff_hz: Bandwidth of the photoreceptor in Hz. The mapped intensity passes a first-order low-pass filter
+        with time constant 1 / (2 pi cutoff_hz), solved exactly for an input that is linear in time between the frames.
+        None means unlimited bandwidth.
+    :param cutoff_intensity: Intensity above which the bandwidth is ``cutoff_hz``. In less light it shrinks in
+        proportion, to a tenth at least, much as in v2e. Because the intensity of the new frame counts, the number of
+        frames then makes a small difference. None means the same bandwidth in any light.
     :param seed: Seed of the threshold mismatch, the leak phases and the noise.
-    :raises ValueError: on a parameter out of its range.
+    :raises ValueError: If a parameter is out of range.
     """
 
     def __init__(
@@ -141,32 +145,32 @@ class EventCamera:
         self.cutoff_intensity = cutoff_intensity
         self._rng = np.random.default_rng(seed)
         mismatch = self._rng.standard_normal((2, height * width)) * threshold_sigma
-        #: Thresholds of every pixel, shape (2, height * width): positive, negative.
+        # Thresholds of every pixel, shape (2, height * width): positive, negative
         self.thresholds: FloatArray = np.maximum(nominal[:, None] + mismatch, 0.1 * nominal[:, None])
-        # Shares of a threshold; without a phase the whole sensor would flash at once.
+        # Phases as shares of a threshold; without them the whole sensor would flash at once
         self._leak_phase: FloatArray = self._rng.random(height * width) if leak_rate else np.zeros(height * width)
         self.reset()
 
     @classmethod
     def preset(cls, name: str, height: int, width: int, **overrides: Any) -> EventCamera:
         """
-        A camera with the parameters of :data:`PRESETS`, which says what frames each expects.
+        Create a camera with the parameters of :data:`PRESETS`, which states the frames that each preset expects.
 
         :param name: ``"ideal"``, ``"carla"`` or ``"noisy"``.
-        :param height: Rows of the sensor.
-        :param width: Columns of the sensor.
-        :param overrides: Parameters of :class:`EventCamera` in place of or beside those of the preset.
-        :raises ValueError: on an unknown name or a parameter out of its range.
+        :param height: Rows of the sensor in pixels.
+        :param width: Columns of the sensor in pixels.
+        :param overrides: Parameters of :class:`EventCamera` that replace or extend those of the preset.
+        :raises ValueError: If the name is unknown or a parameter is out of range.
         """
         if name not in PRESETS:
             raise ValueError(f"preset must be one of {tuple(PRESETS)}, got {name!r}")
         return cls(height, width, **{**PRESETS[name], **overrides})
 
     def reset(self) -> None:
-        """Forget the scene: the next frame only sets the reference. The thresholds and leak phases stay."""
+        """Forget the scene, so that the next frame only sets the reference. Thresholds and leak phases stay."""
         self._time: float | None = None
         self._start = 0.0
-        # Mapped intensity, the same behind the low-pass filter, and with the leak on top: what crosses thresholds.
+        # Mapped intensity, its low-pass filtered value, and that plus the leak, which crosses the thresholds
         self._input: FloatArray = np.zeros(self.height * self.width)
         self._filtered: FloatArray = np.zeros(self.height * self.width)
         self._level: FloatArray = np.zeros(self.height * self.width)
@@ -175,13 +179,13 @@ class EventCamera:
 
     def step(self, frame: ArrayLike, t: float) -> NDArray[np.void]:
         """
-        Events between the previous frame and this one.
+        Return the events between the previous frame and this one.
 
-        :param frame: Intensity >= 0 of shape (height, width) (any real number for ``mapping="identity"``).
-        :param t: Time of the frame in seconds, later than the previous one.
-        :return: Structured array with fields x, y, t, p, sorted by time; empty for the first frame after a reset.
-        :raises ValueError: on a wrong shape, a negative or non-finite intensity, or a time that does not advance. The
-            camera is then as before the call.
+        :param frame: Intensity >= 0, shape (height, width); any real number with ``mapping="identity"``.
+        :param t: Time of the frame in seconds, later than that of the previous frame.
+        :return: Array of :data:`EVENT_DTYPE`, sorted by time; empty for the first frame after a reset.
+        :raises ValueError: If the shape is wrong, an intensity is negative or not finite, or the time does not advance.
+            The camera is then in the same state as before the call.
         """
         pixel, times, polarity = self.detect(frame, t)
         order = _by_time(times)
@@ -193,11 +197,11 @@ class EventCamera:
 
     def detect(self, frame: ArrayLike, t: float, rng: np.random.Generator | None = None) -> Events:
         """
-        The events of :meth:`step` as flat arrays and in no particular order, which is all that binning needs.
+        Return the events of :meth:`step` as flat arrays in no particular order, which is all that binning needs.
 
         :param frame: As in :meth:`step`.
         :param t: As in :meth:`step`.
-        :param rng: Source of the shot noise in place of the camera's own.
+        :param rng: Generator of the shot noise, instead of the camera's own.
         :return: Pixel index (row * width + column), time in seconds and polarity (+1.0 or -1.0) of every event.
         """
         intensity = self._check(frame)
@@ -210,12 +214,12 @@ class EventCamera:
             self._reference = level - self._leak_phase * self.thresholds[0]
             return np.empty(0, np.int64), np.empty(0), np.empty(0)
         if not self._time < t < np.inf:
-            raise ValueError(f"time must advance: got t={t!r} after t={self._time!r}; call reset() to start anew")
+            raise ValueError(f"time must advance: got t={t!r} after t={self._time!r}; call reset() first")
         if self.cutoff_hz is not None:
             level = self._low_pass(mapped, intensity, t - self._time)
             self._input, self._filtered = mapped, level
         if self.leak_rate:
-            # A reference that sinks steadily is the same as a brightness that rises steadily.
+            # A steadily sinking reference is equivalent to a steadily rising brightness
             level = level + self.thresholds[0] * (self.leak_rate * (t - self._start))
         events = self._crossings(level, self._time, t)
         if self.shot_rate:
@@ -231,18 +235,15 @@ class EventCamera:
         return events
 
     def _check(self, frame: ArrayLike) -> FloatArray:
-        """The frame as one row of numbers that the mapping takes."""
+        """Check a frame and return it flat."""
         intensity = np.asarray(frame, dtype=np.float64)
         if intensity.shape != (self.height, self.width):
-            raise ValueError(
-                f"frame must have shape {(self.height, self.width)}, got {intensity.shape}; give one grey image, or "
-                "make a camera of this size"
-            )
+            raise ValueError(f"frame must be a grey image of shape {(self.height, self.width)}, got {intensity.shape}")
         if not np.isfinite(intensity).all():
-            raise ValueError("frame holds NaN or infinite intensities; replace them, np.nan_to_num does")
+            raise ValueError("frame holds NaN or infinite intensities")
         if self.mapping != "identity" and intensity.min() < 0:
             raise ValueError(
-                f"frame must be >= 0, got a minimum of {intensity.min()!r}; use mapping='identity' for logs"
+                f"frame must be >= 0, got a minimum of {intensity.min()!r}; use mapping='identity' for logarithms"
             )
         return intensity.reshape(-1)
 
@@ -255,29 +256,29 @@ class EventCamera:
         return np.where(intensity <= LIN_LOG_KNEE, linear, np.log(np.maximum(intensity, LIN_LOG_KNEE)))
 
     def _low_pass(self, mapped: FloatArray, intensity: FloatArray, dt: float) -> FloatArray:
-        """Where the filter stands after its input went straight from its previous value to ``mapped``."""
+        """Output of the filter after its input went from its previous value to ``mapped`` in a straight line."""
         assert self.cutoff_hz is not None
         tau: float | FloatArray = 1 / (2 * np.pi * self.cutoff_hz)
         if self.cutoff_intensity is not None:
             tau = tau / np.clip(intensity / self.cutoff_intensity, 0.1, 1)
-        lag = (mapped - self._input) / dt * tau  # behind a ramp, once it has settled
+        lag = (mapped - self._input) / dt * tau  # steady-state lag behind a ramp
         return np.asarray(mapped - lag + (self._filtered - self._input + lag) * np.exp(-dt / tau))
 
     def _crossings(self, level: FloatArray, t0: float, t1: float) -> Events:
         """Every threshold crossing on the straight line from the previous level to this one."""
         gap = level - self._reference
-        # The slack keeps pixels that sit on a threshold: the exact comparison below decides about them.
+        # The slack keeps pixels close to a threshold, for the exact comparison below to decide
         pixel = np.flatnonzero((gap > self.thresholds[0] * (1 - 1e-9)) | (gap < self.thresholds[1] * (1e-9 - 1)))
         gap = gap[pixel]
         sign, step = np.sign(gap), np.where(gap > 0, *self.thresholds[:, pixel])
-        # From here on a fall is a rise, its levels negated, which loses no bit.
+        # Negate the levels of falling pixels, which is exact, so that every pixel rises
         start, end, reference = sign * self._level[pixel], sign * level[pixel], sign * self._reference[pixel]
 
-        # Division may be off by one at a boundary; the comparison that defines a crossing settles it.
+        # The division may be off by one at a boundary, so compare with the definition of a crossing
         count = np.floor(np.abs(gap) / step)
         count += reference + (count + 1) * step <= end
         count -= reference + count * step > end
-        # The moved reference is rounded: it may leave a level that has come to rest on a threshold just beyond it.
+        # A level at rest on a threshold may lie just beyond the rounded reference, and must not fire again
         count *= (count > 0) & (end != start)
         repeats = count.astype(np.int64)
         self._reference[pixel] = sign * (reference + count * step)
@@ -294,12 +295,12 @@ class EventCamera:
         return rng.integers(size, size=total), rng.uniform(t0, t1, total), polarity
 
     def _drop_refractory(self, pixel: IntArray, times: FloatArray, polarity: FloatArray) -> Events:
-        """Drop the events that fall into their pixel's dead time; only an event that is kept starts a new one."""
+        """Drop events in the dead time of their pixel. Only events that are kept start a new dead time."""
         order = _by_pixel(pixel, times)
         pixel, times, polarity = pixel[order], times[order], polarity[order]
-        another = np.diff(pixel, append=-1) == 0  # follows in the same pixel
+        another = np.diff(pixel, append=-1) == 0  # the next event is in the same pixel
         keep = np.zeros(len(pixel), dtype=bool)
-        # The first event of every pixel, the second of those that have one, and so on: each is visited once.
+        # Visit the first event of every pixel, then the second of those that have one, and so on
         nth = np.flatnonzero(np.diff(pixel, prepend=-1))
         while len(nth):
             alive = nth[times[nth] - self._last_event[pixel[nth]] >= self.refractory]
@@ -310,7 +311,7 @@ class EventCamera:
 
 
 def _by_time(times: FloatArray) -> IntArray:
-    """Stable order of the times. The sort that is not stable is several times faster, and the same without ties."""
+    """Stable order of the times. Without ties the unstable sort gives the same and is several times faster."""
     order = np.argsort(times)
     if (np.diff(times[order]) == 0).any():
         order = np.argsort(times, kind="stable")
@@ -318,7 +319,7 @@ def _by_time(times: FloatArray) -> IntArray:
 
 
 def _by_pixel(pixel: IntArray, times: FloatArray) -> IntArray:
-    """``np.lexsort((times, pixel))``, faster where the events of most pixels are in order already: crossings are."""
+    """``np.lexsort((times, pixel))``, but faster if the events of most pixels are already sorted, as crossings are."""
     order = np.argsort(pixel, kind="stable")
     pixel, times = pixel[order], times[order]
     late = (np.diff(times) < 0) & (np.diff(pixel) == 0)

@@ -1,10 +1,13 @@
-"""What can go wrong with a sensor: pure functions that corrupt one image or vector, and the table of their severities.
+"""
+Sensor failures: functions that corrupt one image or vector, and the table of their severities.
 
-Every function has the form ``f(image, rng, **parameters) -> new image``: it leaves its input alone and keeps shape and
-dtype. The kinds follow the common-corruption benchmarks of robust perception (Hendrycks and Dietterich, "Benchmarking
-Neural Network Robustness to Common Corruptions and Perturbations", ICLR 2019) and what event and depth cameras add;
-the numbers are our own. Images are uint8 (H, W, C) as everywhere in this package: events 128 + signed count with 0 for
-"no data", depth 1..255 with 0 for "nothing there".
+Each function is pure, ``f(image, rng, **parameters) -> new image``, and keeps shape and dtype. To add a failure, write
+such a function and enter it into :data:`FAILURES`.
+
+The kinds follow the common-corruption benchmarks of robust perception (Hendrycks and Dietterich, "Benchmarking Neural
+Network Robustness to Common Corruptions and Perturbations", ICLR 2019), plus what is specific to event and depth
+cameras; the severities are our own. Images are uint8 (H, W, C): events as 128 + signed count with 0 for "no data",
+depth as 1..255 with 0 for "nothing there".
 """
 
 from __future__ import annotations
@@ -22,80 +25,90 @@ Array = NDArray[Any]
 Image = NDArray[np.uint8]
 Rng = np.random.Generator
 
-#: What a sensor can be; it decides what each failure looks like.
 SENSORS: Final = ("rgb", "event", "depth", "vector")
-#: Exponent between the digital numbers of a colour camera and light.
+"""Kinds of sensors, which determine what a failure looks like."""
+# Exponent between the digital numbers of a colour camera and light
 GAMMA: Final = 2.2
-#: Events per bin of a hot pixel of an event camera.
+# Events per bin of a hot pixel of an event camera
 HOT_COUNT: Final = 20
-#: Bounds of a vector farther apart than this say nothing about its scale.
+# Bounds of a vector beyond this do not indicate its scale
 UNBOUNDED: Final = 1e6
 
 
 class Failure:
     """
-    One kind of failure on one sort of sensor.
+    One kind of failure of one kind of sensor.
 
     :param function: ``f(image, rng, **parameters)``, a function of this module.
-    :param parameters: Its named parameters: a triple for the three severities, or one number for all of them.
+    :param unsigned: Parameters that differ for event images whose codes never fall below "no event", as in the
+        representations "count", "polarity" and "time_surface".
+    :param parameters: Named parameters of the function, each a triple for the three severities or one value for all.
     """
 
-    def __init__(self, function: Callable[..., Array], **parameters: float | tuple[float, float, float]) -> None:
+    def __init__(
+        self,
+        function: Callable[..., Array],
+        unsigned: Mapping[str, Any] | None = None,
+        **parameters: float | tuple[float, float, float],
+    ) -> None:
         self.function = function
+        self.unsigned = dict(unsigned or {})
         self.parameters = parameters
 
-    def at(self, severity: int) -> dict[str, float]:
-        """The parameters at severity 1, 2 or 3."""
-        return {
+    def at(self, severity: int, signed: bool = True) -> dict[str, Any]:
+        """
+        Return the parameters of the function.
+
+        :param severity: 1, 2 or 3.
+        :param signed: Whether the codes of an event image may fall below "no event".
+        """
+        parameters = {
             name: value[severity - 1] if isinstance(value, tuple) else value for name, value in self.parameters.items()
         }
+        return parameters if signed else {**parameters, **self.unsigned}
 
 
 def lose(image: Array, rng: Rng, share: float, blank: int) -> Array:
     """
-    A bank of columns is no longer read: the last ``share`` of them is ``blank``. Columns, because in most scenes the
-    rows of the sky would not be missed.
+    Stop reading a bank of columns: the last ``share`` of them becomes ``blank``.
+
+    Columns instead of rows, because in most scenes the rows of the sky would not be missed.
     """
     lost = image.copy()
-    lost[:, _first_lost(image.shape[1], share) :] = blank
+    lost[_last(image, share)] = blank
     return lost
 
 
-def hold(image: Array, rng: Rng, past: Array, share: float) -> Array:
-    """A bank of columns is no longer read: the last ``share`` of them keeps what it showed in ``past``."""
-    held = image.copy()
-    first = _first_lost(image.shape[1], share)
-    held[:, first:] = past[:, first:]
-    return held
-
-
 def lose_entries(vector: Array, rng: Rng, low: Array, high: Array, share: float) -> Array:
-    """The last ``share`` of the entries of a vector reads zero, or the bound nearest to it."""
+    """Set the last ``share`` of the entries of a vector to zero, or to the bound closest to zero."""
     lost = vector.copy()
-    lost[_first_lost(len(vector), share) :] = 0
+    lost[_last(vector, share)] = 0
     return np.clip(lost, low, high)
 
 
-def hold_entries(vector: Array, rng: Rng, past: Array, share: float) -> Array:
-    """The last ``share`` of the entries of a vector keeps what it showed in ``past``."""
-    first = _first_lost(len(vector), share)
-    return np.concatenate((vector[:first], past[first:]))
+def hold(image: Array, rng: Rng, past: Array, share: float) -> Array:
+    """Freeze the last ``share`` of the columns (of the entries of a vector) at their values in ``past``."""
+    held = image.copy()
+    last = _last(image, share)
+    held[last] = past[last]
+    return held
 
 
 def delay(image: Array, rng: Rng, past: Array, steps: float) -> Array:
-    """The image of ``steps`` steps ago, ``past``."""
+    """Show the image of ``steps`` steps ago, ``past``."""
     return past.copy()
 
 
 def gaussian_noise(image: Image, rng: Rng, sigma: float) -> Image:
-    """Normal noise on every digital number. ``sigma`` of 255."""
+    """Add normal noise of standard deviation ``sigma`` (in codes) to all channels."""
     return _codes(image + sigma * rng.standard_normal(image.shape, np.float32), 0)
 
 
 def spurious_events(image: Image, rng: Rng, rate: float, signed: bool = True) -> Image:
     """
-    Events out of thin air, of either sign or, if not ``signed``, counted up. ``rate`` expected per pixel and bin; where
-    there is no data stays 0.
+    Add random events, ``rate`` per pixel and bin on average, of either polarity or, if not ``signed``, as counts.
+
+    Pixels without data (0) stay so.
     """
     entries = rng.integers(image.size, size=rng.poisson(rate * image.size))
     signs = rng.choice((-1.0, 1.0), len(entries)) if signed else np.ones(len(entries))
@@ -104,14 +117,15 @@ def spurious_events(image: Image, rng: Rng, rate: float, signed: bool = True) ->
 
 def depth_noise(image: Image, rng: Rng, sigma: float) -> Image:
     """
-    Normal noise on the code of every valid pixel; "nothing there" stays. ``sigma`` in codes, in the logarithmic
-    encoding 2.3% of the distance each.
+    Add normal noise of standard deviation ``sigma`` (in codes) to every valid pixel; "nothing there" stays.
+
+    In the logarithmic encoding a code is 2.3% of the distance.
     """
     return np.where(image > 0, _codes(image + sigma * rng.standard_normal(image.shape, np.float32), 1), image)
 
 
 def vector_noise(vector: Array, rng: Rng, low: Array, high: Array, sigma: float) -> Array:
-    """Normal noise, clipped to the bounds. ``sigma`` of the width of each entry's range, or of 1 without bounds."""
+    """Add normal noise, clipped to the bounds; ``sigma`` is relative to the range of each entry, 1 without bounds."""
     _, width = _range(low, high)
     noisy = vector + sigma * width * rng.standard_normal(vector.shape)
     return np.clip(noisy, low, high).astype(vector.dtype)
@@ -119,8 +133,9 @@ def vector_noise(vector: Array, rng: Rng, low: Array, high: Array, sigma: float)
 
 def impulses(image: Image, rng: Rng, share: float, dark: int, bright: int, void: int | None = None) -> Image:
     """
-    Salt and pepper: other pixels each time read ``dark`` or ``bright`` in all channels. ``share`` of the pixels; those
-    that read ``void`` are spared.
+    Salt and pepper: set ``share`` of the pixels, different ones each time, to ``dark`` or ``bright`` in all channels.
+
+    Values equal to ``void`` are kept.
     """
     draw = rng.random(image.shape[:2])[..., None]
     spoilt = np.where(draw < share / 2, dark, np.where(draw < share, bright, image)).astype(np.uint8)
@@ -128,14 +143,15 @@ def impulses(image: Image, rng: Rng, share: float, dark: int, bright: int, void:
 
 
 def expose(image: Image, rng: Rng, stops: float) -> Image:
-    """Wrong exposure: 2 ** ``stops`` times the light, in the gamma of the image; what leaves the range is clipped."""
+    """Expose the image to 2 ** ``stops`` times the light, in its gamma; values out of range are clipped."""
     return _codes(image * np.float32(2 ** (stops / GAMMA)), 0)
 
 
 def blur(image: Image, rng: Rng, length: float) -> Image:
     """
-    The camera shakes during the exposure: a straight smear in a direction drawn each time, as one frame has no past to
-    average. ``length`` of the image's width, 3 pixels at least.
+    Smear the image along a straight line in a random direction, as if the camera shook during the exposure.
+
+    ``length`` is relative to the width of the image, 3 pixels at least.
     """
     pixels = max(3, round(length * image.shape[1]))
     angle = rng.uniform(0, np.pi)
@@ -149,8 +165,9 @@ def blur(image: Image, rng: Rng, length: float) -> Image:
 
 def stick(image: Image, rng: Rng, share: float, dark: int, bright: int) -> Image:
     """
-    Dead pixels: half of them stuck at ``dark``, half at ``bright``, in all channels. ``share`` of the pixels, at least
-    one. A generator in the same state gives the same pixels, and more of them at a larger share.
+    Dead pixels: ``share`` of them, at least one, are stuck in all channels, half at ``dark`` and half at ``bright``.
+
+    A generator in the same state gives the same pixels, and a larger share includes those of a smaller one.
     """
     stuck = image.copy()
     pixels = stuck.reshape(-1, image.shape[-1])
@@ -160,7 +177,7 @@ def stick(image: Image, rng: Rng, share: float, dark: int, bright: int) -> Image
 
 
 def stick_entries(vector: Array, rng: Rng, low: Array, high: Array, share: float) -> Array:
-    """Stuck entries, each at a value drawn from its range. ``share`` of the entries, at least one."""
+    """Stuck entries: ``share`` of them, at least one, are stuck at random values within their range."""
     middle, width = _range(low, high)
     values = np.clip(middle + width * rng.uniform(-0.5, 0.5, vector.shape), low, high).astype(vector.dtype)
     order = rng.permutation(len(vector))[: max(1, round(share * len(vector)))]
@@ -171,8 +188,9 @@ def stick_entries(vector: Array, rng: Rng, low: Array, high: Array, share: float
 
 def shift(image: Image, rng: Rng, distance: float) -> Image:
     """
-    The sensor sits askew: everything is moved in a direction drawn from ``rng``, the edge repeated. ``distance`` of the
-    image's width, at least one pixel.
+    Move the image in a random direction and repeat its edge, as if the sensor were mounted askew.
+
+    ``distance`` is relative to the width of the image, one pixel at least.
     """
     height, width = image.shape[:2]
     pixels, angle = max(1.0, distance * width), rng.uniform(0, 2 * np.pi)
@@ -183,15 +201,17 @@ def shift(image: Image, rng: Rng, distance: float) -> Image:
 
 def storm(image: Image, rng: Rng, rate: float, signed: bool = True) -> Image:
     """
-    A flickering light floods the sensor: all pixels fire together, brighter in one bin and darker in the next or, if
-    not ``signed``, counted up in all. ``rate`` expected per pixel and bin; where there is no data stays 0.
+    Flood the sensor with the events of a flickering light, ``rate`` per pixel and bin on average.
+
+    All pixels fire together, with polarities that alternate by bin or, if not ``signed``, as counts. Pixels without
+    data (0) stay so.
     """
     signs = rng.choice((-1, 1)) * (-1) ** np.arange(image.shape[-1]) if signed else 1
     return _add_events(image, signs * rng.poisson(rate, image.shape))
 
 
 def drop_patches(image: Image, rng: Rng, share: float, patch: float) -> Image:
-    """No return from square patches. ``share`` of the patches, each with sides of ``patch`` of the image's width."""
+    """Drop the returns of ``share`` of the square patches, whose side is ``patch`` of the image's width."""
     height, width = image.shape[:2]
     side = max(1, round(patch * width))
     grid = rng.random((-(-height // side), -(-width // side))) < share
@@ -199,8 +219,11 @@ def drop_patches(image: Image, rng: Rng, share: float, patch: float) -> Image:
     return np.where(lost, np.uint8(0), image)
 
 
-def _first_lost(length: int, share: float) -> int:
-    return length - max(1, round(share * length))
+def _last(image: Array, share: float) -> tuple[slice, ...]:
+    """Index of the last columns of an image, or of the last entries of a vector; at least one."""
+    axis = 1 if image.ndim == 3 else 0
+    length = image.shape[axis]
+    return (slice(None),) * axis + (slice(length - max(1, round(share * length)), None),)
 
 
 def _codes(values: Array, least: int) -> Image:
@@ -212,7 +235,7 @@ def _add_events(image: Image, counts: Array) -> Image:
 
 
 def _range(low: Array, high: Array) -> tuple[Array, Array]:
-    """Middle and width of each entry's range; 0 and 1 for an entry without bounds."""
+    """Middle and width of the range of each entry; 0 and 1 for an entry without bounds."""
     low, high = low.astype(np.float64), high.astype(np.float64)
     bounded = (low > -UNBOUNDED) & (high < UNBOUNDED)
     low, high = np.where(bounded, low, -0.5), np.where(bounded, high, 0.5)
@@ -225,16 +248,6 @@ _DEAD: Final = (0.01, 0.05, 0.2)
 _LAG: Final = (1, 2, 4)
 _ASKEW: Final = (0.03, 0.06, 0.12)
 
-#: Every failure: kind -> sensor -> function and parameters at severities 1, 2, 3. A sensor that is missing does not
-#: know the kind: an event camera, for one, has no exposure and no motion blur. What the parameters mean:
-#:
-#: - ``share``: of the columns (black, frozen), pixels (salt_and_pepper, dead_pixels), patches (depth_dropout) or
-#:   entries of a vector that fail; ``blank``, ``dark``, ``bright``: what they read; ``void``: a code that is spared
-#: - ``sigma``: standard deviation of noise: rgb and depth in codes, vectors in widths of their range
-#: - ``rate``: additional events per pixel and bin, see also :data:`UNSIGNED`
-#: - ``stops``: powers of two of light
-#: - ``length``, ``distance``, ``patch``: in widths of the image
-#: - ``steps``: of the environment
 FAILURES: Final[Mapping[str, Mapping[str, Failure]]] = {
     "black": {
         "rgb": Failure(lose, share=_THIRDS, blank=0),
@@ -242,21 +255,16 @@ FAILURES: Final[Mapping[str, Mapping[str, Failure]]] = {
         "depth": Failure(lose, share=_THIRDS, blank=0),  # no return
         "vector": Failure(lose_entries, share=_THIRDS),
     },
-    "frozen": {
-        "rgb": Failure(hold, share=_THIRDS),
-        "event": Failure(hold, share=_THIRDS),
-        "depth": Failure(hold, share=_THIRDS),
-        "vector": Failure(hold_entries, share=_THIRDS),
-    },
+    "frozen": {sensor: Failure(hold, share=_THIRDS) for sensor in SENSORS},
     "noise": {
         "rgb": Failure(gaussian_noise, sigma=(15.0, 30.0, 60.0)),
-        "event": Failure(spurious_events, rate=(0.05, 0.2, 0.8)),
+        "event": Failure(spurious_events, unsigned={"signed": False}, rate=(0.05, 0.2, 0.8)),
         "depth": Failure(depth_noise, sigma=(3.0, 8.0, 20.0)),
         "vector": Failure(vector_noise, sigma=(0.05, 0.1, 0.2)),
     },
     "salt_and_pepper": {
         "rgb": Failure(impulses, share=_IMPULSES, dark=0, bright=255),
-        "event": Failure(impulses, share=_IMPULSES, dark=1, bright=255, void=0),
+        "event": Failure(impulses, unsigned={"dark": EVENT_ZERO}, share=_IMPULSES, dark=1, bright=255, void=0),
         "depth": Failure(impulses, share=_IMPULSES, dark=1, bright=255, void=0),
     },
     "overexposure": {"rgb": Failure(expose, stops=(1.0, 2.0, 4.0))},
@@ -270,26 +278,30 @@ FAILURES: Final[Mapping[str, Mapping[str, Failure]]] = {
         "vector": Failure(stick_entries, share=(0.1, 0.25, 0.5)),
     },
     "misalignment": {sensor: Failure(shift, distance=_ASKEW) for sensor in ("rgb", "event", "depth")},
-    "event_storm": {"event": Failure(storm, rate=(1.0, 4.0, 16.0))},
+    "event_storm": {"event": Failure(storm, unsigned={"signed": False}, rate=(1.0, 4.0, 16.0))},
     "depth_dropout": {"depth": Failure(drop_patches, share=(0.1, 0.3, 0.6), patch=1 / 16)},
 }
+"""
+All failures: kind -> sensor -> function and its parameters at severities 1, 2, 3. A kind lists the sensors that can
+have it: event cameras, for example, have neither exposure nor motion blur. The parameters are
 
-#: What differs in event images of the representations "count", "polarity" and "time_surface", whose codes do not fall
-#: below "no event": kind -> parameters.
-UNSIGNED: Final[Mapping[str, Mapping[str, Any]]] = {
-    "noise": {"signed": False},
-    "salt_and_pepper": {"dark": EVENT_ZERO},
-    "event_storm": {"signed": False},
-}
+- ``share``: of the columns (black, frozen), pixels (salt_and_pepper, dead_pixels), patches (depth_dropout) or entries
+  of a vector that fail; ``blank``, ``dark``, ``bright``: their values; ``void``: a code that is kept;
+- ``sigma``: standard deviation of the noise, in codes (rgb, depth) or relative to the range (vector);
+- ``rate``: additional events per pixel and bin;
+- ``stops``: powers of two of light;
+- ``length``, ``distance``, ``patch``: relative to the width of the image;
+- ``steps``: steps of the environment.
+"""
 
 
 def failures_for(sensor: str) -> tuple[str, ...]:
     """
-    The kinds of failure that a sensor knows.
+    List the kinds of failure of a sensor.
 
     :param sensor: "rgb", "event", "depth" or "vector".
     :return: Keys of :data:`FAILURES`, in its order.
-    :raises ValueError: on another sensor.
+    :raises ValueError: If the sensor is unknown.
     """
     if sensor not in SENSORS:
         raise ValueError(f"sensor must be one of {SENSORS}, got {sensor!r}")

@@ -1,8 +1,9 @@
-"""What an environment renders, as a sensor of its agent. Any number of sensors share one rendering a step.
+"""
+Sensors that look at what an environment renders. Any number of them share one rendering per step.
 
-MuJoCo: a process that has rendered with it must not be forked, its children hang in their first rendering. Making an
-environment with these wrappers does not render MuJoCo. After a rendering in the parent, start the workers with
-``AsyncVectorEnv(..., context="spawn")`` or ``SubprocVecEnv(..., start_method="forkserver")``, its default.
+MuJoCo: a process that has rendered with MuJoCo must not be forked, because its children hang at their first rendering.
+These wrappers do not render MuJoCo when they are created. If the parent process has rendered, start the workers with
+``AsyncVectorEnv(..., context="spawn")`` or ``SubprocVecEnv(..., start_method="forkserver")`` (the default).
 """
 
 from __future__ import annotations
@@ -24,15 +25,15 @@ from sb3_have.sensors.checks import describe, is_number, parse_size
 Array = NDArray[Any]
 Observation = dict[str, Any]
 
-#: Key under which an observation that is no Dict appears beside the sensors.
+# Key of the original observation if it is not a Dict
 STATE = "state"
-#: Render modes that show colours, and those that show depth. gymnasium's ``RenderCollection`` makes the lists.
+# Render modes that show colours, and those that show depth; Gymnasium's RenderCollection returns the lists
 COLOUR_MODES = ("rgb_array", "rgbd_tuple", "rgb_array_list", "rgbd_tuple_list")
 DEPTH_MODES = ("depth_array", "rgbd_tuple", "depth_array_list", "rgbd_tuple_list")
 
 
 class Frames(NamedTuple):
-    """What a sensor sees since the previous step, oldest first; the last of each list is now."""
+    """Frames rendered since the previous step, oldest first; the last of each list is the current one."""
 
     colour: list[Array]
     depth: list[Array]
@@ -40,43 +41,40 @@ class Frames(NamedTuple):
 
 class SensorWrapper(gym.Wrapper[Observation, Any, Any, Any], gym.utils.RecordConstructorArgs):
     """
-    Base of the wrappers that add one modality. A Dict observation gets one more key; any other observation becomes a
-    Dict with the keys ``"state"`` and ``key``.
+    Base class of the wrappers that add an image to the observation.
 
-    The environment is rendered once a step, however many wrappers look: ``render()`` of this wrapper returns a copy of
-    the rendering that the observation was made from until the next step or reset.
+    A Dict observation gets one more key. Any other observation becomes a Dict with the keys ``"state"`` and ``key``.
+
+    The environment is rendered once per step, however many sensors it has: until the next step or reset, ``render()``
+    returns a copy of the rendering that the observation was made from.
 
     :param env: Environment to wrap.
-    :param key: Key of the modality.
-    :param replaces: A key that the modality may take the place of.
-    :raises ValueError: if the key exists already or is no string.
+    :param key: Key of the image.
+    :param replaces: Existing key that the image may replace.
+    :raises ValueError: If the key already exists.
     """
 
     def __init__(self, env: gym.Env[Any, Any], key: str, replaces: str | None = None) -> None:
         gym.Wrapper.__init__(self, env)
         space = env.observation_space
-        #: The spaces of the wrapped environment by key.
+        # Spaces of the wrapped environment by key
         self.inner_spaces: dict[str, spaces.Space[Any]] = (
             dict(space.spaces) if isinstance(space, spaces.Dict) else {STATE: space}
         )
-        if not isinstance(key, str):
-            raise ValueError(f"{self.class_name()}: key must be a string, got {key!r}")
         if key in self.inner_spaces and key != replaces:
             raise ValueError(
-                f"{self.class_name()}: the observation has a key {key!r} already, among {list(self.inner_spaces)}; "
+                f"{self.class_name()}: the observation already has the key {key!r}, among {list(self.inner_spaces)}; "
                 "choose another with key=..."
             )
         self.key = key
-        # Its own generator: an environment behaves the same with and without the sensor.
+        # The sensor's own generator, so that the environment behaves the same with and without the sensor
         self._rng = np.random.default_rng()
         self._rendered: Any = None
-        # Rows and columns of the source, None until they are known.
-        self._source_size: tuple[int, ...] | None = None
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """As the environment; a seed also seeds the noise of the sensor."""
+        """Reset the environment and the sensor; the seed is also that of the sensor's noise."""
         if seed is not None:
             self._rng = np.random.default_rng((seed, zlib.crc32(self.key.encode())))
         self._rendered = None
@@ -84,56 +82,40 @@ class SensorWrapper(gym.Wrapper[Observation, Any, Any, Any], gym.utils.RecordCon
         return self._extend(observation, start=True), info
 
     def step(self, action: Any) -> tuple[Observation, Any, bool, bool, dict[str, Any]]:
-        """As the environment."""
+        """Step the environment and read the sensor."""
         self._rendered = None
         observation, reward, terminated, truncated, info = self.env.step(action)
         return self._extend(observation, start=False), reward, terminated, truncated, info
 
     def render(self) -> Any:
-        """As the environment, without rendering the same instant a second time."""
+        """Render the environment, or return a copy of what the sensor has already rendered in this step."""
         return self.env.render() if self._rendered is None else copy.deepcopy(self._rendered)
 
     def sense(self, observation: Observation, start: bool) -> Array:
         """
-        The image of this sensor.
+        Return the image of this sensor.
 
-        :param observation: Of the wrapped environment, as a dict.
+        :param observation: Observation of the wrapped environment as a dict.
         :param start: Whether an episode begins.
         """
         raise NotImplementedError
 
     def look(self) -> Frames:
-        """The frames that the environment renders now, sorted and checked."""
+        """Render the environment and sort the frames into colour and depth."""
         self._rendered = self.env.render()
         viewer = getattr(self.env.unwrapped, "viewer", None)
         if is_highway_env(self.env) and getattr(viewer, "enabled", None) is False:
             raise ValueError(
-                f"{self.class_name()}: with SDL_VIDEODRIVER=dummy highway-env draws nothing and every frame is black; "
-                "unset it, or set it to 'offscreen', before the environment is made"
+                f"{self.class_name()}: highway-env renders only black frames with SDL_VIDEODRIVER=dummy; unset it, or "
+                "set it to 'offscreen', before creating the environment"
             )
-        return sort_frames(self.env.render_mode, self._rendered)
-
-    def fit(self, image: Array, size: tuple[int, int], interpolation: int = cv2.INTER_AREA) -> Array:
-        """
-        An image of the source in the size of the sensor.
-
-        :raises ValueError: if the source has another size than before.
-        """
-        shape = image.shape[:2]
-        if self._source_size not in (None, shape):
-            raise ValueError(
-                f"{self.class_name()}: the source of {self.key!r} had {self._source_size} rows and columns, and now "
-                f"has {shape}; its size may not change, so resize its images before this wrapper"
-            )
-        self._source_size = shape
-        return resize(image, size, interpolation)
+        return sort_frames(str(self.env.render_mode), self._rendered)
 
     def _extend(self, observation: Any, start: bool) -> Observation:
         inner = dict(observation) if isinstance(self.env.observation_space, spaces.Dict) else {STATE: observation}
         return {**inner, self.key: self.sense(inner, start)}
 
-    def _announce(self, height: int, width: int, channels: int) -> None:
-        """Put the modality into the observation space."""
+    def _add_space(self, height: int, width: int, channels: int) -> None:
         inner = self.env.observation_space
         image = spaces.Box(0, 255, (height, width, channels), np.uint8)
         self.observation_space = spaces.Dict(
@@ -141,8 +123,8 @@ class SensorWrapper(gym.Wrapper[Observation, Any, Any, Any], gym.utils.RecordCon
             sort_keys=inner.sort_keys if isinstance(inner, spaces.Dict) else True,
         )
 
-    def _rendered_size(self, modes: Sequence[str]) -> tuple[int, int]:
-        """Rows and columns of the rendering; where they cannot be known, from a first one."""
+    def _rendered_size(self) -> tuple[int, int]:
+        """Rows and columns of the rendering. Only MuJoCo's are known without rendering a first frame."""
         renderer = getattr(self.env.unwrapped, "mujoco_renderer", None)
         if renderer is not None:
             return int(renderer.height), int(renderer.width)
@@ -156,29 +138,30 @@ class SensorWrapper(gym.Wrapper[Observation, Any, Any, Any], gym.utils.RecordCon
     def _first_size(self, see: Callable[[], Array]) -> tuple[int, int]:
         """Rows and columns of a first image, for which the environment is reset."""
         if hasattr(self.env.unwrapped, "mujoco_renderer"):
-            # AsyncVectorEnv makes one environment in the parent and then forks.
+            # AsyncVectorEnv creates one environment in the parent process and then forks
             raise ValueError(
-                f"{self.class_name()} of a MuJoCo environment needs image_size= with a function as source: to find the "
-                "size it would have to render, and a process that has rendered MuJoCo cannot be forked"
+                f"{self.class_name()}: a function as source needs image_size= in a MuJoCo environment, because a "
+                "process that has rendered MuJoCo cannot be forked"
             )
         self.env.reset()
-        height, width = self._source_size = see().shape[:2]
+        height, width = see().shape[:2]
         self._rendered = None
         return height, width
 
 
 class RenderObservation(SensorWrapper):
     """
-    Adds what the environment renders to the observation, as a colour image.
+    Adds the rendering to the observation, as a uint8 (H, W, 3) image.
 
-    :param env: Any environment made with ``render_mode="rgb_array"`` or, for depth from the same rendering,
-        ``"rgbd_tuple"``. A process that has rendered MuJoCo must not be forked, see the top of this module.
+    Unlike ``gymnasium.wrappers.AddRenderObservation`` it can resize the rendering, shares it with the other sensors,
+    and accepts render modes with depth and lists of frames.
+
+    :param env: Environment with ``render_mode="rgb_array"``, or ``"rgbd_tuple"`` to get depth from the same rendering.
     :param key: Key of the image.
-    :param image_size: Rows and columns, one number for both or a pair. Each pixel is the mean of the area it covers.
-        None keeps the rendering's own, which takes a first rendering (MuJoCo says it without): the environment is
-        reset when it is wrapped, which ends an episode under way and takes a draw from its generator.
-    :raises ValueError: on another render mode, a key that exists already, an impossible size, or a rendering whose
-        size changes.
+    :param image_size: Rows and columns in pixels, one number for both or a pair. Each pixel is the mean of the area
+        that it covers. By default the size of the rendering; unless that is MuJoCo's, the environment is reset once to
+        find it out.
+    :raises ValueError: If the render mode does not show colours or the key already exists.
     """
 
     def __init__(
@@ -187,21 +170,23 @@ class RenderObservation(SensorWrapper):
         gym.utils.RecordConstructorArgs.__init__(self, key=key, image_size=image_size)
         SensorWrapper.__init__(self, env, key)
         check_render_mode(env, COLOUR_MODES, self.class_name())
-        self.image_size = parse_size(image_size) or self._rendered_size(COLOUR_MODES)
-        self._announce(*self.image_size, 3)
+        self.image_size = parse_size(image_size) or self._rendered_size()
+        self._add_space(*self.image_size, 3)
 
     def sense(self, observation: Observation, start: bool) -> NDArray[np.uint8]:
-        """The latest frame, uint8 (H, W, 3)."""
-        # A copy: other sensors look at the rendering too.
-        return np.array(self.fit(self.look().colour[-1], self.image_size), order="C")
+        """Return the latest frame, uint8 (H, W, 3)."""
+        # Copy, because other sensors use the same rendering
+        return np.array(resize(self.look().colour[-1], self.image_size), order="C")
 
 
 class IntermediateFrames:
     """
-    The frames that highway-env renders between two decisions. It hands them to the ``RecordVideo`` that it was told
-    of; inside a ``with`` block this object is in its place, and passes the word on.
+    Collects the frames that highway-env renders between two decisions.
 
-    :param env: A highway-env environment, unwrapped.
+    highway-env passes these frames to its ``RecordVideo`` wrapper. Inside a ``with`` block this object takes the place
+    of the recorder, and forwards the frames to it.
+
+    :param env: Unwrapped environment of highway-env.
     """
 
     def __init__(self, env: Any) -> None:
@@ -225,15 +210,20 @@ class IntermediateFrames:
 
 
 def is_highway_env(env: gym.Env[Any, Any]) -> bool:
-    """Whether this is one of highway-env's environments, told by what :class:`IntermediateFrames` relies on."""
+    """Check for an environment of highway-env, by what :class:`IntermediateFrames` relies on."""
     return hasattr(env.unwrapped, "set_record_video_wrapper") and hasattr(env.unwrapped, "_record_video_wrapper")
 
 
 def step_duration(env: gym.Env[Any, Any]) -> float | None:
     """
-    Seconds of one step: highway-env's decision interval, else the attribute ``dt`` of the environment, else
-    1 / ``metadata["render_fps"]``; None if it says nothing. (The frame rate comes last: it is that of a video, and
-    Pendulum's and highway-env's do not run in real time.)
+    Return the duration of a step in seconds.
+
+    This is highway-env's decision interval, else the attribute ``dt`` of the environment, else
+    1 / ``metadata["render_fps"]``. The frame rate comes last because it is that of a video, which need not run in real
+    time: Pendulum's and highway-env's do not.
+
+    :param env: Environment, wrapped or not.
+    :return: Seconds; None if the environment states none of them.
     """
     if is_highway_env(env):
         return 1 / float(env.unwrapped.config["policy_frequency"])  # type: ignore[attr-defined]
@@ -246,50 +236,51 @@ def step_duration(env: gym.Env[Any, Any]) -> float | None:
 
 def check_render_mode(env: gym.Env[Any, Any], modes: Sequence[str], wrapper: str) -> None:
     """
-    :raises ValueError: unless the environment was made with one of the render modes; says which it offers.
+    Check the render mode of an environment.
+
+    :param env: Environment to check.
+    :param modes: Render modes that the wrapper accepts.
+    :param wrapper: Name of the wrapper, for the message.
+    :raises ValueError: If the environment was created with another mode; the message lists what it offers.
     """
     if env.render_mode in modes:
         return
-    offered = [mode for mode in env.metadata.get("render_modes", ()) if mode in modes]
+    available = env.metadata.get("render_modes", [])
+    offered = [mode for mode in available if mode in modes]
     remedy = (
         f"pass render_mode={offered[0]!r} to gym.make"
         if offered
-        else f"this environment offers only {env.metadata.get('render_modes', [])}: give source= a key or a function"
+        else f"this environment only offers {available}: use an observation key or a function as source"
     )
     raise ValueError(f"{wrapper} needs render_mode {' or '.join(modes[:2])}, got {env.render_mode!r}; {remedy}")
 
 
-def sort_frames(mode: str | None, rendered: Any) -> Frames:
+def sort_frames(mode: str, rendered: Any) -> Frames:
     """
-    Colour and depth frames in what ``render()`` returned.
+    Sort what ``render()`` returned into colour and depth frames.
 
-    :param mode: The render mode, one of :data:`COLOUR_MODES` or :data:`DEPTH_MODES`.
-    :param rendered: What ``render()`` returned in that mode.
-    :raises ValueError: if it is not what the mode promises.
+    :param mode: Render mode, one of :data:`COLOUR_MODES` or :data:`DEPTH_MODES`.
+    :param rendered: Return value of ``render()``.
+    :raises ValueError: If there is no frame, or if a frame has the wrong shape or dtype.
     """
-    mode = str(mode)
-    several = list(rendered) if mode.endswith("_list") and rendered is not None else [rendered]
-    frames = Frames([], [])
-    for frame in several:
-        parts = dict(zip(("rgb", "depth"), frame, strict=True)) if mode.startswith("rgbd") else {mode[:3]: frame}
-        for name, part in parts.items():
-            colour = name == "rgb"
-            fits = isinstance(part, np.ndarray) and (
-                part.ndim == 3 and part.shape[2] == 3 and part.dtype == np.uint8
-                if colour
-                else part.ndim == 2 and part.dtype.kind == "f"
-            )
-            if not fits:
-                wanted = "uint8 (H, W, 3)" if colour else "float (H, W)"
-                raise ValueError(f"render() in mode {mode!r} should return {wanted}, got {describe(part)}")
-            (frames.colour if colour else frames.depth).append(part)
-    if not several:
-        raise ValueError(f"render() in mode {mode!r} returned no frame; is it called elsewhere between two steps?")
-    return frames
+    frames = list(rendered or ()) if mode.endswith("_list") else [rendered]
+    if not frames:
+        raise ValueError(f"render() in mode {mode!r} returned no frame; is it also called elsewhere between two steps?")
+    if mode.startswith("rgbd"):
+        colour, depth = ([frame[i] for frame in frames] for i in (0, 1))
+    else:
+        colour, depth = (frames, []) if mode.startswith("rgb") else ([], frames)
+    for frame in colour:
+        if not isinstance(frame, np.ndarray) or frame.shape[2:] != (3,) or frame.dtype != np.uint8:
+            raise ValueError(f"render() in mode {mode!r} must return uint8 (H, W, 3), got {describe(frame)}")
+    for frame in depth:
+        if not isinstance(frame, np.ndarray) or frame.ndim != 2 or frame.dtype.kind != "f":
+            raise ValueError(f"render() in mode {mode!r} must return float depth (H, W), got {describe(frame)}")
+    return Frames(colour, depth)
 
 
 def resize(image: Array, size: tuple[int, int], interpolation: int = cv2.INTER_AREA) -> Array:
-    """The image with this many (rows, columns); the channels stay."""
+    """Resize an image (H, W) or (H, W, C) to these rows and columns; its channels stay."""
     if image.shape[:2] == size:
         return image
     return cv2.resize(np.ascontiguousarray(image), size[::-1], interpolation=interpolation)
