@@ -12,6 +12,7 @@ import fnmatch
 import functools
 import math
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, ClassVar, Concatenate, ParamSpec, TypeVar
 
 import carla
@@ -70,19 +71,18 @@ class SensorData:
         self.frame = frame
 
 
-class _Buffered(SensorData):
+class Image(SensorData):
     def __init__(self, frame: int, size: int, data: bytes) -> None:
         super().__init__(frame)
         self._buffer = bytearray(data)
-        self.raw_data, self.width, self.height = memoryview(self._buffer).toreadonly(), size, size
+        self.raw_data, self.width, self.height = memoryview(self._buffer), size, size
 
 
-class Image(_Buffered):
-    pass
-
-
-class DVSEventArray(_Buffered):
-    pass
+class DVSEventArray(SensorData):
+    def __init__(self, frame: int, data: bytes) -> None:
+        super().__init__(frame)
+        self._buffer = bytearray(data)
+        self.raw_data = memoryview(self._buffer)
 
 
 class CollisionEvent(SensorData):
@@ -153,7 +153,7 @@ class BlueprintLibrary:
 
 class Actor:
     def __init__(self, server: Server, number: int, blueprint: ActorBlueprint, pose: carla.Transform) -> None:
-        self._server, self._life, self._episode = server, server.life, server.episode
+        self._server, self._life = server, server.life
         self._number, self._blueprint = number, blueprint
         self._x, self._y, self._z = pose.location.x, pose.location.y, pose.location.z
         self._yaw, self._speed = math.radians(pose.rotation.yaw), 0.0
@@ -295,20 +295,13 @@ class Client:
     @remote
     def apply_batch_sync(self, commands: list[Any], do_tick: bool = False) -> list[Any]:
         assert all(isinstance(command, carla.command.DestroyActor) for command in commands) and not do_tick
-        return [Response(self._server.remove(command.actor_id)) for command in commands]
-
-
-class Response:
-    def __init__(self, error: str) -> None:
-        self.error = error
-
-    def has_error(self) -> bool:
-        return bool(self.error)
+        errors = [self._server.remove(command.actor_id) for command in commands]
+        return [SimpleNamespace(error=error, has_error=lambda error=error: bool(error)) for error in errors]
 
 
 class World:
     def __init__(self, server: Server) -> None:
-        self._server, self._life, self._episode = server, server.life, server.episode
+        self._server, self._life = server, server.life
 
     @remote
     def get_map(self) -> carla.Map:
@@ -342,12 +335,13 @@ class World:
         return self._server.library
 
     @remote
-    def get_actors(self) -> ActorList:
+    def get_actors(self) -> list[Actor]:
         actors = self._server.actors
-        return ActorList([copy.copy(actors[number]) for number in self._server.listed if number in actors])
+        return [copy.copy(actors[number]) for number in self._server.listed if number in actors]
 
-    def get_snapshot(self) -> WorldSnapshot:
-        return WorldSnapshot(self._server)
+    def get_snapshot(self) -> Any:
+        server = self._server
+        return SimpleNamespace(timestamp=carla.Timestamp(server.frame, server.elapsed, server.dt, 0.0))
 
     @remote
     def try_spawn_actor(
@@ -362,19 +356,6 @@ class World:
         self._server.timeouts["ticks"] = seconds
         run_traffic_managers()
         return self._server.tick()
-
-
-class WorldSnapshot:
-    def __init__(self, server: Server) -> None:
-        self.timestamp = carla.Timestamp(server.frame, server.elapsed, server.dt, 0.0)
-
-
-class ActorList:
-    def __init__(self, actors: list[Actor]) -> None:
-        self._actors = actors
-
-    def __iter__(self) -> Iterator[Actor]:
-        return iter(self._actors)
 
 
 def run_traffic_managers() -> None:

@@ -27,7 +27,7 @@ FAKES = [cls for cls in FAKES if inspect.isclass(cls) and not cls.__name__.start
 # Attributes of instances that the package reads
 FIELDS: dict[str, tuple[str, ...]] = {
     "Image": ("frame", "raw_data", "width", "height"),
-    "DVSEventArray": ("frame", "raw_data", "width", "height"),
+    "DVSEventArray": ("frame", "raw_data"),
     "CollisionEvent": ("frame", "normal_impulse"),
     "Response": ("error", "has_error"),
     "WorldSnapshot": ("timestamp",),

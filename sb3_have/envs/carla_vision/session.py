@@ -223,11 +223,8 @@ class Session:
     # ---- end of the session ----
 
     def usable(self) -> bool:
-        """Whether the server still answers, has the same world, and is in synchronous mode."""
-        try:
-            return not self._closing and self._alive() and self.world.get_settings().synchronous_mode
-        except RuntimeError:
-            return False  # another world was loaded
+        """Whether the session was not closed, and the server still answers and is in synchronous mode."""
+        return not self._closing and self._alive() and self.world.get_settings().synchronous_mode
 
     def connection_error(self, what: str) -> CarlaConnectionError:
         """Create an error that explains how to start a server."""
