@@ -1,7 +1,7 @@
 """CarlaVision-v0 on the fake server: interface, observations, and where the vehicles are."""
 
 import hashlib
-from typing import Any, get_args
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -13,16 +13,13 @@ from stable_baselines3.common.env_checker import check_env as check_sb3_env
 carla = pytest.importorskip("carla", reason="needs the client module of CARLA: pip install 'sb3_have[carla]'")
 
 import fake_carla_fixtures  # noqa: E402
-from envs import TINY  # noqa: E402
 from fake_carla_fixtures import ALONE, FULL, SMALL, STRAIGHT, Start, fresh  # noqa: E402
 from fake_carla_server import COLLISION, DEPTH, DVS, RGB, Server  # noqa: E402
 
-from sb3_have import HAVESAC  # noqa: E402
 from sb3_have.envs.carla_vision import CarlaVisionEnv  # noqa: E402
 from sb3_have.envs.vision import compose  # noqa: E402
 from sb3_have.envs.weather import WEATHERS  # noqa: E402
 from sb3_have.sensors import encode_depth  # noqa: E402
-from sb3_have.sensors.representations import Representation  # noqa: E402
 
 server, start = fake_carla_fixtures.server, fake_carla_fixtures.start
 
@@ -95,16 +92,6 @@ def test_render(start: Start) -> None:
     picture = env.render()
     assert picture is not None and picture.shape == (64, 192, 3) and env.metadata["render_fps"] == 5
     np.testing.assert_array_equal(picture, compose(observation, representation="polarity"))
-
-
-def test_havesac_learns(server: Server) -> None:
-    env = CarlaVisionEnv(image_size=32, vehicles_count=2, timeout=1.0, max_episode_steps=6, initial_speed=10.0)
-    model = HAVESAC(
-        "MultiInputPolicy", env, buffer_size=50, learning_starts=4, batch_size=4, seed=0, policy_kwargs=TINY
-    )
-    model.learn(15)
-    assert model.num_timesteps == 15 and model._n_updates > 5
-    env.close()
 
 
 # ---- seeds ----
@@ -186,13 +173,6 @@ def test_images_are_those_that_the_server_sent(
         np.testing.assert_array_equal(observation["event"], by_hand)
         assert (by_hand != 128).mean() > 0.1
     server.join()
-
-
-@pytest.mark.parametrize("representation", get_args(Representation))
-def test_representations(start: Start, representation: str) -> None:
-    env = start(modalities=("event",), event={"representation": representation, "bins": 3}, initial_speed=20.0)
-    observation, *_ = env.step(FULL)
-    assert env.observation_space.contains(observation) and len(np.unique(observation["event"])) > 2
 
 
 def test_tau_of_the_time_surface(start: Start) -> None:

@@ -150,14 +150,7 @@ class Session:
                 "tm_port=..."
             )
         self._undo.append(self._stop_traffic_manager)
-        try:
-            self.traffic_manager = self.client.get_trafficmanager(self.tm_port)
-        except RuntimeError as error:
-            self._undo.pop()
-            raise RuntimeError(
-                f"could not start a traffic manager on port {self.tm_port}: {error}. If the port is in use, choose "
-                "another `tm_port`"
-            ) from error
+        self.traffic_manager = self.client.get_trafficmanager(self.tm_port)
         _tm_ports.add(self.tm_port)
         self.traffic_manager.set_synchronous_mode(True)
 
