@@ -29,7 +29,7 @@ _RESTART: Final = (
 )
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class Session:
     """
     A CARLA server in synchronous mode, with the actors of one episode.
