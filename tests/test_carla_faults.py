@@ -149,6 +149,8 @@ def test_restart_without_traffic(server: Server) -> None:
     works(server, env)
     assert server.map.name.endswith("Town04")
     env.reset()
+    server.fail("World.get_settings", RuntimeError("trying to access an expired episode"))
+    env.reset()
     server.restart()
     with pytest.raises(CarlaConnectionError, match="lost the CARLA server"):
         env.step(FULL)

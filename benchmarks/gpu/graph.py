@@ -97,9 +97,7 @@ class GraphedUpdate:
 
     def __init__(self, model: HAVESAC, batch_size: int, warm_up: int = 3):
         if model.use_sde:
-            raise ValueError(
-                "use_sde=True is not supported, because SB3 checks its standard deviations on the host"
-            )
+            raise ValueError("use_sde=True is not supported, because SB3 checks its standard deviations on the host")
         self.model, self.batch_size, self.warm_up = model, batch_size, warm_up
         self.batch: StaticBatch | None = None
         self.learning_rate = th.zeros((), device=model.device)

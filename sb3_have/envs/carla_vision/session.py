@@ -216,8 +216,11 @@ class Session:
     # ---- end of the session ----
 
     def usable(self) -> bool:
-        """Whether the session was not closed, and the server still answers and is in synchronous mode."""
-        return not self._closing and self._alive() and self.world.get_settings().synchronous_mode
+        """Whether the session was not closed, and the server still has the same world in synchronous mode."""
+        try:
+            return not self._closing and self._alive() and self.world.get_settings().synchronous_mode
+        except RuntimeError:
+            return False  # the server has another world, so that the handle expired
 
     def connection_error(self, what: str) -> CarlaConnectionError:
         """Create an error that explains how to start a server."""
