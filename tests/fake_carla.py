@@ -343,12 +343,19 @@ class World:
         server = self._server
         return SimpleNamespace(timestamp=carla.Timestamp(server.frame, server.elapsed, server.dt, 0.0))
 
-    @remote
     def try_spawn_actor(
         self, blueprint: ActorBlueprint, transform: carla.Transform, attach_to: Actor | None = None
     ) -> Actor | None:
         expect(transform, carla.Transform)
-        return self._server.spawn(blueprint, transform, attach_to)
+        try:
+            self._server.reach("World.try_spawn_actor", self)
+        except RuntimeError as error:
+            if "time-out" in str(error):
+                return None  # the real client also hides a lost connection
+            raise
+        actor = self._server.spawn(blueprint, transform, attach_to)
+        self._server.finish("World.try_spawn_actor")
+        return actor
 
     @remote
     def tick(self, seconds: float = 10.0) -> int:
@@ -397,4 +404,6 @@ class TrafficManager:
 
     @remote
     def shut_down(self) -> None:
+        if self._synchronous:
+            self._server.violations.append("a traffic manager was shut down in synchronous mode")
         self._usable = False
