@@ -205,6 +205,13 @@ def test_a_slow_server_is_not_lost(server: Server, env: CarlaVisionEnv) -> None:
     works(server, env)
 
 
+def test_an_error_that_is_no_timeout_does_not_mean_death(server: Server, env: CarlaVisionEnv) -> None:
+    env.reset()
+    server.fail("Client.get_server_version", RuntimeError("rpc::rpc_error during call"))
+    env.close()
+    assert server.left_behind() == []
+
+
 # ---- 3: sensors ----
 
 
