@@ -134,10 +134,10 @@ def test_paper_ends(server: Server, start: Start) -> None:
 
 
 def test_standstill(server: Server, start: Start) -> None:
-    env = start(**ALONE)
+    env = start(**ALONE, crash_penalty=5.0)
     for step in range(25):
-        _, _, terminated, _, info = env.step(STRAIGHT)
-        assert terminated == (step == 24)
+        _, reward, terminated, _, info = env.step(STRAIGHT)
+        assert terminated == (step == 24) and reward == 0  # no penalty at the end
     assert info["end_reason"] == "standstill" and not info["crashed"]
     with pytest.warns(UserWarning, match="after the end"):
         env.step(STRAIGHT)
