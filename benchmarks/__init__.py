@@ -1,1 +1,1 @@
-"""Scripts that measure; their results lie in benchmarks/results."""
+"""Benchmark scripts. Their results are in benchmarks/results."""

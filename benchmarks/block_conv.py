@@ -1,12 +1,13 @@
-"""Time of an encoder's first convolution on pixels and on blocks of pixels (space to depth).
+"""Measure the first convolution of an encoder on pixels and on blocks of pixels (space to depth).
 
     python -m benchmarks.block_conv
 
-8x8 with stride 4 on 64x64 pixels against 2x2 with stride 1 on 16x16 blocks of 4x4 pixels, batch 64, for the 9 and 15
-channels of three stacked colour and event frames: the same sums. ``sb3_have.common.encoders`` reads blocks where the
-CPU has AVX-512. One thread; forward alone, as for the next observations, and forward and backward. Rows, printed and
-written to benchmarks/results/block_conv.csv: median and quartiles of the wall-clock time, and ``vs_pixels``, the median
-over the rounds of its ratio to the same on pixels.
+An 8x8 convolution with stride 4 on 64x64 pixels computes the same sums as a 2x2 convolution with stride 1 on 16x16
+blocks of 4x4 pixels. The batch has 64 images with the 9 and 15 channels of three stacked colour and event frames.
+``sb3_have.common.encoders`` uses blocks on CPUs with AVX-512. The benchmark runs on one thread and times the forward
+pass alone, as for the next observations, and forward and backward pass together. It prints and writes to
+benchmarks/results/block_conv.csv the median and quartiles of the wall-clock time, and ``vs_pixels``, the median over
+the rounds of the ratio to the time on pixels.
 """
 
 from __future__ import annotations

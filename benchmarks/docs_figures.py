@@ -1,9 +1,9 @@
-"""Draws the figures of docs/method.md: the structure of HAVE, and what it learns of values that are known exactly.
+"""Draw the figures of docs/method.md: the structure of HAVE, and how well it learns values that are known exactly.
 
-    OMP_NUM_THREADS=1 python -m benchmarks.docs_figures                    # docs/figures/*.png; trains for minutes
-    python -m benchmarks.docs_figures --figures structure.png              # this one trains nothing
+    OMP_NUM_THREADS=1 python -m benchmarks.docs_figures                    # docs/figures/*.png, takes minutes
+    python -m benchmarks.docs_figures --figures structure.png              # without training
 
-What is trained are a few seeds on :class:`benchmarks.known_q.SensorRing`; ``benchmarks/STUDY.md`` has eight of each.
+The figures show a few seeds on :class:`benchmarks.known_q.SensorRing`; ``benchmarks/STUDY.md`` has eight of each form.
 """
 
 from __future__ import annotations
@@ -23,36 +23,42 @@ from matplotlib.patches import FancyBboxPatch
 from benchmarks.known_q import FORMS, Floats, Samples, evaluate, make_model, sample
 
 BLUE, ORANGE, GREEN, PINK, GREY = "#0072B2", "#D55E00", "#009E73", "#CC79A7", "#666666"
+# Label and colour of forms of benchmarks.known_q
 CURVES: Mapping[str, tuple[str, str]] = {
     "have": ("HAVE, the default", BLUE),
     "have-unsupervised": ("local_coef=0", GREEN),
     "have-paper": ('target="paper", refusion="free", local_coef=0', ORANGE),
 }
-"""Label and colour of forms of :mod:`benchmarks.known_q`."""
 SEEDS = (0, 1, 2)
 N_UPDATES = 1200
+# Updates between two points of a curve
 EVERY = 100
-"""Updates between two points of a curve."""
 
 
-class Learnt(NamedTuple):
-    """What a form has become, on fresh samples."""
+class Learned(NamedTuple):
+    """
+    A trained form, evaluated on fresh samples.
+
+    :param samples: The samples
+    :param errors: Error before training and after every ``EVERY`` updates, in standard deviations of the exact Q
+    :param q: (B,), the Q-value used by the actor and the target, mean of the twins
+    :param weights: (B, d), weights of the modalities
+    """
 
     samples: Samples
     errors: list[float]
-    """After every ``EVERY`` updates, the first before any: in standard deviations of the exact Q."""
     q: Floats
-    """(B,): the value that acts, mean of the twins."""
     weights: Floats
-    """(B, d)."""
 
 
 @cache
-def learn(form: str, seed: int, n_updates: int = N_UPDATES) -> Learnt:
+def learn(form: str, seed: int, n_updates: int = N_UPDATES) -> Learned:
     """
-    :param form: of ``FORMS``
-    :param seed: of networks, transitions, minibatches and samples
-    :param n_updates: in all
+    Train a form and evaluate it.
+
+    :param form: One of ``FORMS``
+    :param seed: Seed of networks, transitions, minibatches and samples
+    :param n_updates: Total number of updates
     """
     model = make_model(seed, **FORMS[form])
     samples = sample(seed=seed)
@@ -62,11 +68,11 @@ def learn(form: str, seed: int, n_updates: int = N_UPDATES) -> Learnt:
         errors.append(evaluate(model, samples)["error"])
     with th.no_grad():
         parts = model.critic.decompose(samples.observations, samples.actions)
-    return Learnt(samples, errors, parts["q"].mean(dim=0).double().numpy(), parts["weights"].double().numpy())
+    return Learned(samples, errors, parts["q"].mean(dim=0).double().numpy(), parts["weights"].double().numpy())
 
 
 def structure() -> Figure:
-    """Who reads what, from the sensors to the value that acts."""
+    """Draw the flow of information from the sensors to the Q-value."""
     figure = Figure(figsize=(9.0, 4.9), layout="constrained")
     axis = figure.subplots()
     axis.set(xlim=(0, 100), ylim=(0, 54))
@@ -124,12 +130,12 @@ def line(axis: Axes, start: tuple[float, float], end: tuple[float, float]) -> No
 
 
 def branch(axis: Axes, point: tuple[float, float]) -> None:
-    """Lines that meet here are joined, others only cross."""
+    """Mark a point where lines are connected; lines without a mark only cross."""
     axis.plot(*point, "o", color=GREY, markersize=4.5)
 
 
 def values(seeds: Sequence[int] = SEEDS, n_updates: int = N_UPDATES) -> Figure:
-    """The default against the exact Q, and the error of three forms while they learn."""
+    """Plot the default form against the exact Q, and the error of three forms during training."""
     figure = Figure(figsize=(9.0, 3.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     learnt = learn("have", seeds[0], n_updates)
@@ -159,7 +165,7 @@ def values(seeds: Sequence[int] = SEEDS, n_updates: int = N_UPDATES) -> Figure:
 
 
 def weights(seeds: Sequence[int] = SEEDS, n_updates: int = N_UPDATES) -> Figure:
-    """What the weights say of the sensors, with and without supervision of the local critics."""
+    """Plot the weights of reliable and failed sensors, with and without supervision of the local critics."""
     figure = Figure(figsize=(9.0, 3.2), layout="constrained")
     axes = figure.subplots(1, 2, sharey=True)
     titles = {"have": "every critic regressed on the target", "have-unsupervised": "the mixture alone (local_coef=0)"}
@@ -187,7 +193,7 @@ FIGURES: Mapping[str, Callable[[], Figure]] = {"structure.png": structure, "valu
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--figures", nargs="+", choices=list(FIGURES), default=list(FIGURES))
-    parser.add_argument("--out", type=Path, default=Path("docs/figures"), help="folder")
+    parser.add_argument("--out", type=Path, default=Path("docs/figures"), help="output folder")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
     for name in args.figures:

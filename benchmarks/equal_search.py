@@ -1,16 +1,16 @@
-"""The same search of hyper-parameters for every method, on ReliabilityDrive-v0, and what each then makes of its best.
+"""Give every method the same hyperparameter search on ReliabilityDrive-v0, and evaluate each with its best settings.
 
     python -m benchmarks.equal_search                   # 8 trials x 3 methods x 2 seeds, then 8 new seeds of each best
     python -m benchmarks.equal_search --trials 16 --methods gve gve-wide lve have
-    python -m benchmarks.equal_search --report          # only the tables of the runs that are there
+    python -m benchmarks.equal_search --report          # only the tables of existing runs
 
-A trial is a set of hyper-parameters, the first the benchmark's own (``benchmarks.reliability_runs``), the others drawn
-from ``SPACE`` by a seeded generator: all methods are tried with the same sets and the same seeds. A method's best is
-the set with the largest mean ``area`` (of the learning curve) over the seeds of the search; it is then trained anew
-with seeds that the search has not seen and evaluated in other episodes, so that what is reported has not been selected.
+A trial is a set of hyperparameters. The first one is the benchmark's own (``benchmarks.reliability_runs``), the others
+are drawn from ``SPACE`` by a seeded generator, so all methods are tried with the same sets and the same seeds. The best
+trial of a method has the largest mean area under the learning curve over the seeds of the search. It is then trained
+with new seeds and evaluated in other episodes, so that the reported results are free of selection bias.
 
-Rows of the runs lie in ``<out>/trial-<i>/<method>.csv`` and ``<out>/best-<i>/<method>.csv``, the sets in
-``<out>/trials.csv``. Runs that are there are not repeated: the command can be stopped and given again.
+The results are in ``<out>/trial-<i>/<method>.csv`` and ``<out>/best-<i>/<method>.csv``, the trials in
+``<out>/trials.csv``. Existing runs are not repeated, so the command can be stopped and started again.
 """
 
 from __future__ import annotations
@@ -32,17 +32,18 @@ from benchmarks.reliability_runs import EVALUATION_SEED, HYPERPARAMETERS, METHOD
 DEFAULT_METHODS = ("gve-wide", "lve", "have")
 SPACE = ("learning_rate", "tau", "gamma", "policy_delay")
 SEARCH_SEEDS = (100, 200)
+# Seed of the evaluation episodes of the search; the reported ones use reliability_runs.EVALUATION_SEED
 SEARCH_EVALUATION_SEED = 2_000_000
-"""Of the episodes that decide in the search; those that are reported are ``reliability_runs.EVALUATION_SEED``'s."""
+# Number of seeds for the best trial of each method, starting from 0
 N_SEEDS = 8
-"""Of the runs with each method's best, from 0 on."""
 
 
 def draw_trials(n_trials: int, seed: int = 0) -> list[dict[str, Any]]:
     """
-    Sets of hyper-parameters: the benchmark's own, then learning rate log-uniform in 3e-4 to 3e-3, tau log-uniform in
-    0.003 to 0.03, gamma of 0.95, 0.98, 0.99, the actor every update or every second one. More trials begin with the
-    same ones.
+    Draw the trials: the benchmark's own hyperparameters first, then log-uniform learning rates in 3e-4..3e-3,
+    log-uniform tau in 0.003..0.03, gamma from 0.95, 0.98 and 0.99, and a policy delay of 1 or 2.
+
+    A larger number of trials starts with the same ones.
     """
     rng = np.random.default_rng(seed)
     drawn = [
@@ -60,7 +61,7 @@ def draw_trials(n_trials: int, seed: int = 0) -> list[dict[str, Any]]:
 def search(
     methods: Sequence[str], trials: Sequence[Mapping[str, Any]], n_updates: int, n_workers: int, out: Path
 ) -> None:
-    """Makes the runs that are missing: every trial of every method, then the best of each method with new seeds."""
+    """Run what is missing: every trial of every method, then the best trial of each method with new seeds."""
     for i, trial in enumerate(trials):
         _make(methods, SEARCH_SEEDS, trial, n_updates, n_workers, out / f"trial-{i}", SEARCH_EVALUATION_SEED)
     best = best_trials(methods, len(trials), n_updates, out)
@@ -71,14 +72,14 @@ def search(
 
 def record(trials: Sequence[Mapping[str, Any]], out: Path) -> None:
     """
-    Writes the trials down, or compares them with those of the runs that are there.
+    Save the trials, and check that they match those of existing runs.
 
-    :raises ValueError: if they are others
+    :raises ValueError: If they do not
     """
     file = out / "trials.csv"
     before = pd.read_csv(file, index_col="trial").to_dict("records") if file.exists() else []
     if any(dict(trial) != known for trial, known in zip(trials, before, strict=False)):
-        raise ValueError(f"{file} has other trials than those that are drawn now: choose another --out.")
+        raise ValueError(f"{file} has other trials than this search; choose another --out")
     if len(trials) > len(before):
         out.mkdir(parents=True, exist_ok=True)
         pd.DataFrame(trials).rename_axis("trial").to_csv(file)
@@ -97,12 +98,12 @@ def _make(
     made = run_all(todo, n_updates, n_workers, hyperparameters=trial, evaluation_seed=evaluation_seed)
     for i, rows in enumerate(made, 1):
         save(rows, folder)
-        told = {measure: value for _, _, _, measure, value in rows}
-        print(f"{folder.name} {i}/{len(todo)} {rows[0][0]}-{rows[0][1]}: {summary(told)}", flush=True)
+        measures = {measure: value for _, _, _, measure, value in rows}
+        print(f"{folder.name} {i}/{len(todo)} {rows[0][0]}-{rows[0][1]}: {summary(measures)}", flush=True)
 
 
 def areas(method: str, n_trials: int, n_updates: int, out: Path) -> list[float]:
-    """Mean area under the learning curve over the seeds of the search, for each trial; NaN while a run is missing."""
+    """Compute the mean area under the learning curve of each trial; NaN if a run is missing."""
     means = []
     for i in range(n_trials):
         rows = load(out / f"trial-{i}")
@@ -113,21 +114,21 @@ def areas(method: str, n_trials: int, n_updates: int, out: Path) -> list[float]:
 
 def best_trials(methods: Sequence[str], n_trials: int, n_updates: int, out: Path) -> dict[str, int]:
     """
-    The number of each method's best trial.
+    Find the best trial of each method.
 
-    :raises FileNotFoundError: if not all trials of a method have their runs, since the best would not be known
+    :raises FileNotFoundError: If a run is missing
     """
     scores = {method: areas(method, n_trials, n_updates, out) for method in methods}
     for method, means in scores.items():
         if np.isnan(means).any():
             raise FileNotFoundError(
-                f"{out}: {method} lacks runs of trial {int(np.isnan(means).argmax())}: make them without --report."
+                f"{out}: {method} lacks runs of trial {int(np.isnan(means).argmax())}; run without --report"
             )
     return {method: int(np.argmax(means)) for method, means in scores.items()}
 
 
 def tables(methods: Sequence[str], trials: Sequence[Mapping[str, Any]], n_updates: int, out: Path) -> str:
-    """The trials with every method's area, the best of each in bold, then the statistics of the best ones' new runs."""
+    """Format the areas of all trials, and the statistics of the best trials with new seeds."""
     by_method = {method: areas(method, len(trials), n_updates, out) for method in methods}
     best = best_trials(methods, len(trials), n_updates, out)
     lines = [
@@ -153,9 +154,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--updates", type=int, default=N_UPDATES)
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--out", type=Path, default=OUT / "search")
-    parser.add_argument("--report", action="store_true", help="make no runs, write <out>/report.md")
+    parser.add_argument("--report", action="store_true", help="only write <out>/report.md")
     args = parser.parse_args(arguments)
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit("stopped"))  # as by Ctrl-C: the workers are to end too
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("stopped"))  # end the workers, too
     trials = draw_trials(args.trials)
     record(trials, args.out)
     if not args.report:

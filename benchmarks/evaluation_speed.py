@@ -1,12 +1,12 @@
-"""Time of an evaluation by the number of environments that are driven at a time, all in one process.
+"""Measure an evaluation by the number of environments that run at a time, all in one process.
 
     python -m benchmarks.evaluation_speed
 
-The task of the driving benchmark (two cameras of 64 pixels, three stacked frames, "curves"), eight weathers, an
-untrained HAVESAC; episodes are cut after 40 steps. ``predict`` is one forward pass for as many observations. The
-contenders take turns in one process. Rows, printed and written to benchmarks/results/evaluation_speed.csv: median and
-quartiles of the wall-clock time, and ``vs_one``, the median over the rounds of its ratio to the time with one
-environment (for ``predict``, to that of as many passes for one observation).
+An untrained HAVESAC drives the task of the driving benchmark (two cameras of 64 pixels, three stacked frames, "curves")
+in eight weathers, with episodes of at most 40 steps. ``predict`` is one forward pass for as many observations. The
+contenders take turns in one process. The script prints and writes to benchmarks/results/evaluation_speed.csv the median
+and quartiles of the wall-clock time, and ``vs_one``, the median over the rounds of the ratio to the time with one
+environment (for ``predict``, to the same number of passes for one observation).
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ N_ENVS = (1, 8, 16, 32)
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--episodes", type=int, default=4, help="in each weather")
-    parser.add_argument("--steps", type=int, default=40, help="of an episode at most")
+    parser.add_argument("--episodes", type=int, default=4, help="episodes in each weather")
+    parser.add_argument("--steps", type=int, default=40, help="maximum length of an episode")
     args = parser.parse_args()
     assert sb3_have.__version__  # importing the package registers the environment
     th.set_num_threads(1)

@@ -1,10 +1,10 @@
-"""Time of importing the package and the algorithm, beside Stable-Baselines3 and its SAC.
+"""Measure the import of the package and of the algorithm, compared with Stable-Baselines3 and its SAC.
 
     python -m benchmarks.import_time
 
-Each import runs in an interpreter of its own, all in turn; an interpreter that imports nothing is the zero. Rows,
-printed and written to benchmarks/results/import_time.csv: median and quartiles of the wall-clock time, and ``vs_sb3``,
-the median over the rounds of its ratio to ``import stable_baselines3``.
+Each import runs in a new interpreter, and the contenders take turns; an interpreter that imports nothing is the
+baseline. The script prints and writes to benchmarks/results/import_time.csv the median and quartiles of the wall-clock
+time, and ``vs_sb3``, the median over the rounds of the ratio to ``import stable_baselines3``.
 """
 
 from __future__ import annotations

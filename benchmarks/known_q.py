@@ -1,11 +1,11 @@
-"""How well the critic learns an action value that is known in closed form.
+"""Measure how well the critic learns a Q-function that is known in closed form.
 
     OMP_NUM_THREADS=1 python -m benchmarks.known_q                       # every form, 8 seeds each
     OMP_NUM_THREADS=1 python -m benchmarks.known_q --forms have gve --seeds 3
 
-A :class:`SensorRing` gives transitions of the uniform policy; HAVESAC learns that policy's soft Q from them by its own
-``train()``, with an actor that stays uniform; the result is compared with the solution of a linear system. Each seed of
-each form is a row of ``benchmarks/results/known_q/<form>.csv``; what the columns mean is said in :class:`Measures`.
+HAVESAC learns the soft Q-function of the uniform policy from transitions of :class:`SensorRing`, with its own
+``train()`` and an actor that stays uniform. The result is compared with the solution of a linear system. Each seed of
+each form is a row of ``benchmarks/results/known_q/<form>.csv``; see :class:`Measures` for the columns.
 """
 
 from __future__ import annotations
@@ -58,14 +58,14 @@ FORMS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
 
 class SensorRing(gym.Env[Observation, NDArray[np.float32]]):
     """
-    A walk on a ring of states, seen by two sensors that fail in turn.
+    A walk on a ring of states, observed by two sensors that take turns to fail.
 
     The first action steers: the next state is the right neighbour with probability (1 + a_0) / 2, else the left one.
-    The second earns: the reward is ``pay[s] + slope[s] * a_1``. Then the episode ends with probability ``end[s]``, and
-    it is cut after 20 steps. Either sensor shows the whole state, as a code of 8 numbers with a little noise. In most
-    steps one of them fails, never both: it is dark or noisy, and only its own numbers tell. Failures are drawn anew in
-    every step, so that the weights of one step are wrong in the next. ``info``: ``state``, and ``reliable``, a flag for
-    each sensor.
+    The second action changes the reward, which is ``pay[s] + slope[s] * a_1``. Then the episode terminates with
+    probability ``end[s]``; it is truncated after 20 steps. Each sensor shows the whole state, as a code of 8 numbers
+    with a little noise. In most steps one of them fails, but never both: it is dark or noisy, which only shows in its
+    own numbers. Failures are drawn in every step, so that the weights of one step are wrong in the next. ``info``
+    contains ``state`` and ``reliable``, a flag for each sensor.
     """
 
     n_states: ClassVar[int] = 10
@@ -102,16 +102,16 @@ class SensorRing(gym.Env[Observation, NDArray[np.float32]]):
 
     def q_values(self, states: NDArray[np.integer[Any]], actions: Floats, gamma: float, ent_coef: float) -> Floats:
         """
-        Soft Q of the uniform policy, exact.
+        Compute the exact soft Q-values of the uniform policy.
 
         With V(s) = E_a[Q(s, a)] + ent_coef log |A|, Q(s, a) = r(s, a) + gamma (1 - end(s)) E_s'[V(s')] is linear in a,
         so its mean over a is its value at a = 0, and V solves a linear system.
 
-        :param states: (B,)
-        :param actions: (B, 2) in [-1, 1]
-        :param gamma: discount
-        :param ent_coef: temperature, 0 for the ordinary Q
-        :return: (B,)
+        :param states: States, (B,)
+        :param actions: Actions in [-1, 1], (B, 2)
+        :param gamma: Discount factor
+        :param ent_coef: Entropy coefficient, 0 for ordinary Q-values
+        :return: Q-values, (B,)
         """
         right = np.roll(np.eye(self.n_states), 1, axis=1)
         alive = gamma * (1 - self.end)
@@ -124,11 +124,11 @@ class SensorRing(gym.Env[Observation, NDArray[np.float32]]):
 
     @property
     def entropy(self) -> float:
-        """Of the uniform policy on [-1, 1]^2, in nats."""
+        """Entropy of the uniform policy on [-1, 1]^2, in nats."""
         return 2 * math.log(2)
 
     def _observe(self) -> Observation:
-        """The codes of the state, after a fresh draw of which sensor fails, and how."""
+        """Draw which sensor fails and how, and return the codes of the state."""
         failed = self.np_random.choice([0, 1, -1], p=[0.4, 0.4, 0.2])  # -1: none
         noise = (0.1, 2.0)[int(self.np_random.integers(2))]
         self.reliable = np.arange(len(self.keys)) != failed
@@ -141,7 +141,7 @@ class SensorRing(gym.Env[Observation, NDArray[np.float32]]):
 
 
 class UniformActor(Actor):
-    """Draws every action uniformly from [-1, 1]^A, whatever it sees and learns."""
+    """Actor that draws every action uniformly from [-1, 1]^A and does not learn."""
 
     def action_log_prob(self, obs: th.Tensor) -> tuple[th.Tensor, th.Tensor]:  # type: ignore[override]
         n_actions = get_action_dim(self.action_space)
@@ -149,7 +149,7 @@ class UniformActor(Actor):
 
 
 class UniformPolicy(MultiModalPolicy):
-    """HAVE's critics with an actor that stays uniform, so that they evaluate a policy instead of improving it."""
+    """HAVE's critics with a uniform actor, so that they evaluate a policy instead of improving it."""
 
     def make_actor(self, features_extractor: BaseFeaturesExtractor | None = None) -> Actor:
         space = spaces.Box(-np.inf, np.inf, (len(self.critic.encoder.modalities) * self.critic.encoder.features_dim,))
@@ -158,46 +158,52 @@ class UniformPolicy(MultiModalPolicy):
 
 
 class Samples(NamedTuple):
-    """Fresh observations, with the truth about them."""
+    """
+    Fresh observations and actions with their exact Q-values.
+
+    :param observations: Raw observations, (B, 8) per key
+    :param actions: Uniform actions, (B, 2)
+    :param q: Exact Q-values, (B,)
+    :param reliable: Whether each sensor is reliable, (B, d)
+    """
 
     observations: dict[str, th.Tensor]
-    """Raw, (B, 8) each."""
     actions: th.Tensor
-    """(B, 2), uniform."""
     q: Floats
-    """(B,): the exact Q."""
     reliable: NDArray[np.bool_]
-    """(B, d)."""
 
 
 @dataclass
 class Measures:
-    """What the critic learnt of the known Q; NaN where a form has no such part."""
+    """
+    Comparison of the critic with the exact Q-values; NaN where a form has no such part.
+
+    :param error: Root mean square error of the Q-value (mean of the twins), in standard deviations of the exact Q
+    :param bias: Mean error, in standard deviations of the exact Q
+    :param std_ratio: Standard deviation of the Q-value divided by that of the exact Q
+    :param correlation: Correlation with the exact Q
+    :param local_error: ``error`` of each local critic where its sensor is reliable; the larger one
+    :param negative_gradient: Share of samples where the re-fusion decreases in q_g or q_l
+    :param weight_auc: Area under the ROC curve of a sensor's weight as a detector of the reliable sensor
+    :param refusion_optimized: Share of the re-fusion's parameters that are in the critic's optimizer
+    :param refusion_moved: Share of the re-fusion's parameter tensors that training changed
+    :param seconds: Time for collecting and training
+    """
 
     error: float
-    """Root mean square error of the value that acts (mean of the twins), in standard deviations of the exact Q."""
     bias: float
-    """Its mean error, in the same unit."""
     std_ratio: float
-    """Its standard deviation over that of the exact Q."""
     correlation: float
-    """With the exact Q."""
     local_error: float
-    """As ``error``, of each local critic where its sensor is reliable; the worse of the two."""
     negative_gradient: float
-    """Share of samples where the re-fusion falls as q_g or q_l rises."""
     weight_auc: float
-    """Area under the ROC curve of a sensor's weight as a sign that it, and not the other, is the reliable one."""
     refusion_optimized: float
-    """Share of the re-fusion's parameters that are in the critic's optimizer."""
     refusion_moved: float
-    """Share of the re-fusion's parameter tensors that training changed."""
     seconds: float
-    """Of collecting and training."""
 
 
 def make_model(seed: int, **kwargs: Any) -> HAVESAC:
-    """A model with the uniform actor and a replay buffer of the uniform policy, not trained yet."""
+    """Create an untrained model with the uniform actor and a replay buffer filled by the uniform policy."""
     settings: dict[str, Any] = {
         "learning_rate": 1e-3,
         "tau": 0.02,
@@ -217,7 +223,7 @@ def make_model(seed: int, **kwargs: Any) -> HAVESAC:
 
 
 def sample(n_samples: int = N_SAMPLES, seed: int = 0) -> Samples:
-    """Observations from episodes of the uniform policy that no model has been trained on."""
+    """Draw samples from episodes of the uniform policy that no model was trained on."""
     env = SensorRing()
     env.reset(seed=seed + 1_000_000)
     env.action_space.seed(seed + 1_000_000)
@@ -235,7 +241,7 @@ def sample(n_samples: int = N_SAMPLES, seed: int = 0) -> Samples:
 
 
 def evaluate(model: HAVESAC, samples: Samples) -> dict[str, float]:
-    """Everything of :class:`Measures` that a critic and samples tell."""
+    """Compute those of :class:`Measures` that only depend on the critic and the samples."""
     with th.no_grad():
         parts = model.critic.decompose(samples.observations, samples.actions)
     q, std = parts["q"].mean(dim=0).double().numpy(), samples.q.std()
@@ -263,11 +269,12 @@ def evaluate(model: HAVESAC, samples: Samples) -> dict[str, float]:
 
 def negative_gradient(model: HAVESAC, observations: PyTorchObs, actions: th.Tensor) -> float:
     """
-    Share of samples (and twins) in which the value falls as the global or the weighted local value rises; NaN for a
-    model without re-fusion.
+    Compute the share of samples (and twins) where the Q-value decreases in the global or the weighted local value.
 
-    :param observations: raw, a batch
-    :param actions: (B, A), scaled to [-1, 1]
+    :param model: The model
+    :param observations: Batch of raw observations
+    :param actions: Actions scaled to [-1, 1], (B, A)
+    :return: The share; NaN for a model without re-fusion
     """
     if not hasattr(model.critic, "refusion"):
         return math.nan
@@ -283,12 +290,13 @@ def negative_gradient(model: HAVESAC, observations: PyTorchObs, actions: th.Tens
 
 def run(seed: int, n_updates: int = N_UPDATES, n_samples: int = N_SAMPLES, **kwargs: Any) -> Measures:
     """
-    Train one critic and compare it with the truth.
+    Train a critic and compare it with the exact Q-values.
 
-    :param seed: of networks, transitions, minibatches and the samples of the comparison
-    :param n_updates: updates of the critic
-    :param n_samples: of the comparison
-    :param kwargs: of HAVESAC, see ``FORMS``
+    :param seed: Seed of networks, transitions, minibatches and samples
+    :param n_updates: Number of updates of the critic
+    :param n_samples: Number of samples for the comparison
+    :param kwargs: Arguments of HAVESAC, see ``FORMS``
+    :return: The comparison
     """
     start = time.perf_counter()
     model = make_model(seed, **kwargs)
@@ -311,14 +319,14 @@ def root_mean_square(values: Floats) -> float:
 
 
 def auc(scores: Floats, labels: NDArray[np.bool_]) -> float:
-    """Probability that a true sample has the higher score (ties half): the Mann-Whitney statistic."""
+    """Compute the probability that a true sample has the higher score (ties count half), the Mann-Whitney statistic."""
     ranks = pd.Series(scores).rank().to_numpy()
     n_true = int(labels.sum())
     return float((ranks[labels].sum() - n_true * (n_true + 1) / 2) / (n_true * (len(labels) - n_true)))
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
-    """Lowest and highest value of each measure over the seeds, a row for each form."""
+    """Compute the range of each measure over the seeds, one row per form."""
     measured = pd.DataFrame(rows)[["form", *Measures.__annotations__]]
 
     def span(column: pd.Series[float]) -> str:
@@ -330,7 +338,7 @@ def table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--forms", nargs="+", choices=list(FORMS), default=list(FORMS))
-    parser.add_argument("--seeds", type=int, default=8, help="how many, from 0 on")
+    parser.add_argument("--seeds", type=int, default=8, help="number of seeds, starting from 0")
     parser.add_argument("--updates", type=int, default=N_UPDATES)
     args = parser.parse_args()
     folder = RESULTS / "known_q"

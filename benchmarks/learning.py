@@ -1,4 +1,4 @@
-"""How well HAVESAC learns to drive: gathers runs of ``sb3_have.train`` and draws them.
+"""Collect runs of ``sb3_have.train`` and plot how well HAVESAC learns to drive.
 
     for seed in 0 1 2; do for precision in float32 bfloat16; do
         OMP_NUM_THREADS=1 python -m sb3_have.train --config havesac --seed $seed --steps 10000 \\
@@ -8,8 +8,8 @@
     python -m benchmarks.learning runs/float32-* runs/bfloat16-*
 
 Copies each run's training episodes to ``benchmarks/results/learning/monitor-<run>.csv`` and its evaluations to
-``evaluation.csv`` beside them, and draws ``docs/learning.png``, one colour for the seeds of a kind (the name of a run
-without its number). Without runs, it only draws.
+``evaluation.csv`` in the same folder, and draws ``docs/learning.png``, with one colour for all seeds of a kind (the
+name of a run without its number). Without runs, it only draws.
 """
 
 import argparse
@@ -31,7 +31,7 @@ DRIVERS = {
 
 
 def gather(runs: list[Path]) -> None:
-    """Copy what the runs have recorded, in place of what was there."""
+    """Copy the records of the runs, replacing earlier ones."""
     LEARNING.mkdir(parents=True, exist_ok=True)
     for old in LEARNING.glob("monitor-*.csv"):
         old.unlink()
@@ -45,7 +45,7 @@ def gather(runs: list[Path]) -> None:
 
 
 def evaluations() -> pd.DataFrame:
-    """Means over the weathers: a row for each evaluation of each run."""
+    """Load the evaluations, one row per run and step, averaged over the weathers."""
     table = pd.read_csv(LEARNING / "evaluation.csv")
     columns = ["distance_mean", "return_mean", "crash_share", "offroad_share"]
     return table.groupby(["run", "step"], sort=False)[columns].mean().reset_index()
@@ -56,7 +56,7 @@ def kind(run: str) -> str:
 
 
 def draw(out: Path, window: int = 20) -> None:
-    """Distance in training, a running mean over ``window`` episodes, and in evaluations, beside other drivers."""
+    """Plot the distance in training (mean of ``window`` episodes) and in evaluations, with other drivers as levels."""
     figure = Figure(figsize=(10, 4.5), layout="constrained")
     FigureCanvasAgg(figure)
     training, evaluated = figure.subplots(1, 2, sharey=True)

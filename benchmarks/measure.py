@@ -1,4 +1,4 @@
-"""Shared by the speed benchmarks: contenders timed in turn, the machine and versions, and the CSV file of results."""
+"""Helpers of the speed benchmarks: timing of contenders in turn, and the CSV files of results."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 
 
 class Times(NamedTuple):
-    """Milliseconds of every round, by wall clock and by processor time (of all threads)."""
+    """Wall-clock time and processor time (of all threads) of every round, in milliseconds."""
 
     wall: Floats
     cpu: Floats
@@ -31,15 +31,16 @@ def interleave(
     contenders: Mapping[Name, Callable[[], object]], rounds: int, repeats: int = 1, warm_up: int = 1
 ) -> dict[Name, Times]:
     """
-    Time the contenders in turn, so that a change in the machine's speed hits all of them alike.
+    Time the contenders in turn, so that a change in the machine's speed affects all of them.
 
-    Each round visits all of them, in an order drawn anew: what one leaves behind (a trimmed heap, above all) slows
-    its successor down, which must not always be the same.
+    Each round runs all contenders in a new random order, because a contender can slow down the next one (mainly by
+    leaving a trimmed heap), which must not always be the same.
 
-    :param contenders: calls by name
-    :param rounds: visits to each contender that count
-    :param repeats: calls a visit; their mean time counts. A GPU is waited for at the start and at the end of a visit.
-    :param warm_up: rounds before those that count
+    :param contenders: Calls by name
+    :param rounds: Number of rounds that count
+    :param repeats: Calls per round and contender, whose mean time is recorded. A GPU is synchronised before and after.
+    :param warm_up: Number of rounds before those that count
+    :return: Times by name
     """
     wall, cpu = ({name: np.empty(warm_up + rounds) for name in contenders} for _ in range(2))
     rng = np.random.default_rng(0)
@@ -63,23 +64,23 @@ def synchronize() -> None:
 
 
 def quartiles(times: Floats, prefix: str = "", digits: int = 3) -> Row:
-    """Median and quartiles in milliseconds, as columns of a row."""
+    """Compute median and quartiles in milliseconds, as columns of a row."""
     lower, median, upper = np.quantile(times, (0.25, 0.5, 0.75)).round(digits).tolist()
     return {f"{prefix}median_ms": median, f"{prefix}q25_ms": lower, f"{prefix}q75_ms": upper}
 
 
 def median_ratio(numerator: Floats, denominator: Floats) -> float:
-    """Median over the rounds of the ratio of two contenders in the same round."""
+    """Compute the median over the rounds of the ratio of two contenders in the same round."""
     return float(np.median(numerator / denominator))
 
 
 def save(rows: Sequence[Row], path: Path, group: Sequence[str]) -> None:
     """
-    Write the rows; those that the file has already stay, except where they belong to a group measured anew.
+    Write rows to a CSV file. Rows of the file stay, unless they belong to a group that was measured again.
 
-    :param rows: the rows of this run
+    :param rows: The rows of this run
     :param path: CSV file
-    :param group: columns that name what is measured together
+    :param group: Columns that identify a group of rows that are measured together
     """
     new = pd.DataFrame(rows)
     if path.exists():

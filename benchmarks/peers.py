@@ -1,25 +1,27 @@
-"""Time of one update beside peers that are no part of SB3: a bare loop with one camera, and sbx on vectors.
+"""Measure an update of HAVESAC and of peers outside of SB3: a bare loop with one camera, and sbx on vectors.
 
     OMP_NUM_THREADS=1 taskset -c 0 python -m benchmarks.peers       # --tasks camera vector
 
-All contenders have the same layers, batch and data, take turns in one process and update critics, actor, temperature
-and target every time. ``camera``: RGB at 64x64 px, three stacked frames, the Nature encoder, batch 64:
+All contenders have the same layers, batches and data, take turns in one process, and update critics, actor, temperature
+and target every time. The task ``camera`` has RGB images of 64x64 px, three stacked frames, the Nature encoder and
+batches of 64:
 
-- ``bare loop``: what a loop without a framework costs, in the style of DrQ-v2 and CleanRL: the critic trains the
-  encoder, the actor takes its features detached, next observations go through the same encoder, and both observations
-  of a transition lie whole in arrays of bytes;
-- ``HAVESAC``: its defaults; ``HAVESAC gve``: its global critic alone, without auxiliary loss, which is the same
-  algorithm as the bare loop but for its target encoder;
+- ``bare loop``: a loop without a framework in the style of DrQ-v2 and CleanRL. The critic trains the encoder, the actor
+  uses detached features, next observations go through the same encoder, and both observations of a transition are
+  stored whole in arrays of bytes;
+- ``HAVESAC``: the defaults; ``HAVESAC gve``: the global critic alone, without auxiliary losses, which is the same
+  algorithm as the bare loop except for the target encoder;
 - ``SB3 SAC`` and ``SB3 SAC shared``: see ``benchmarks.update_speed``.
 
-``vector``: ``ReliabilityDrive-v0``, three sensors of 32 numbers, two layers of 256, batch 256. ``SB3 SAC`` and ``sbx
-SAC`` (``pip install "sb3_have[peers]"``, left out where it is not installed) read them flattened. HAVESAC has an
-encoder for each sensor (a linear layer of 50 and LayerNorm) in front.
+The task ``vector`` is ``ReliabilityDrive-v0``, with three sensors of 32 numbers, two layers of 256 and batches of 256.
+``SB3 SAC`` and ``sbx SAC`` (``pip install "sb3_have[peers]"``, skipped if it is not installed) use flattened
+observations. HAVESAC also has an encoder per sensor (a linear layer of 50 and LayerNorm).
 
-Columns: ``what`` is ``update`` (one gradient step, sampling included), ``act and store`` (an action for one
-observation, and one transition into the replay memory) or ``learn`` (a step of ``learn()`` with one update, environment
-included); median and quartiles of the wall-clock time, ``cpu_ms``, median processor time, and ``vs_havesac``, the time
-over that of HAVESAC in float32, median over the rounds. ``--threads`` does not bind JAX, ``taskset`` does.
+The columns are ``what``, which is ``update`` (one gradient step, including sampling), ``act and store`` (an action for
+one observation, and one transition into the replay memory) or ``learn`` (a step of ``learn()`` with one update,
+including the environment); median and quartiles of the wall-clock time; ``cpu_ms``, the median processor time; and
+``vs_havesac``, the time divided by that of HAVESAC in float32, median over the rounds. ``--threads`` does not limit
+JAX, but ``taskset`` does.
 """
 
 from __future__ import annotations
@@ -79,13 +81,14 @@ class Twins(nn.Module):
 
 
 class BareLoop:
-    """SAC from pixels without a framework.
+    """
+    SAC from pixels without a framework.
 
-    :param space: of the stacked images, channels first
-    :param n_actions: each in -1..1
-    :param batch_size: of an update
+    :param space: Space of the stacked images, channels first
+    :param n_actions: Number of actions, each in -1..1
+    :param batch_size: Batch size of an update
     :param device: "cpu" or "cuda"
-    :param precision: of the encoder, "float32" or "bfloat16"
+    :param precision: Precision of the encoder, "float32" or "bfloat16"
     """
 
     gamma, tau = 0.99, 0.005
@@ -113,7 +116,7 @@ class BareLoop:
         return features.float()
 
     def sample(self, features: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
-        """Actions and the logarithms of their probabilities (B, 1)."""
+        """Draw actions, and compute their log probabilities (B, 1)."""
         mean, log_std = self.actor(features).chunk(2, dim=1)
         normal = th.distributions.Normal(mean, log_std.clamp(-20, 2).exp(), validate_args=False)
         before = normal.rsample()
@@ -162,7 +165,7 @@ def minimize(loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
 
 
 def camera(device: str, image_size: int = 64, batch_size: int = 64) -> dict[Contender, Callable[[], object]]:
-    """The calls that are timed with one camera; the replay memories are full."""
+    """Create the calls to time with one camera and full replay memories."""
     env = make_env({"rgb": 3}, image_size)
     space, lived = env.observation_space["rgb"], list(transitions(env, BUFFER_SIZE))  # type: ignore[index]
     calls: dict[Contender, Callable[[], object]] = {}
@@ -204,7 +207,7 @@ def camera(device: str, image_size: int = 64, batch_size: int = 64) -> dict[Cont
 
 
 def vector(batch_size: int = 256) -> dict[Contender, Callable[[], object]]:
-    """The calls that are timed on vectors; the models have learned for some steps, so that JAX has compiled."""
+    """Create the calls to time on vectors. The models have learned for some steps, so that JAX has compiled."""
     options: dict[str, Any] = {"buffer_size": 10_000, "learning_starts": 2 * LEARN_STEPS, "batch_size": batch_size}
     options |= {
         "train_freq": 1,
@@ -221,7 +224,7 @@ def vector(batch_size: int = 256) -> dict[Contender, Callable[[], object]]:
         ),
     }
     if find_spec("sbx") is None:
-        print('sbx is not installed and left out: pip install "sb3_have[peers]"')
+        print('sbx is not installed, skipping it: pip install "sb3_have[peers]"')
     else:
         sbx: Any = import_module("sbx")
         models["sbx SAC"] = sbx.SAC("MlpPolicy", FlattenObservation(gym.make(VECTOR_ENV)), **options)
@@ -237,10 +240,12 @@ def vector(batch_size: int = 256) -> dict[Contender, Callable[[], object]]:
 
 
 def measure(calls: Mapping[Contender, Callable[[], object]], rounds: int) -> list[Row]:
-    """A row for every call.
+    """
+    Measure the calls.
 
-    :param calls: by contender, precision and what is done
-    :param rounds: that count
+    :param calls: Calls by contender, precision and kind
+    :param rounds: Number of rounds that count
+    :return: One row per call
     """
     measured = interleave(calls, rounds, warm_up=max(1, rounds // 10))
     rows = []
@@ -257,7 +262,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", choices=("camera", "vector"), default=["camera", "vector"])
     parser.add_argument("--rounds", type=int, default=30)
-    parser.add_argument("--device", default="cpu", help="of the camera's contenders")
+    parser.add_argument("--device", default="cpu", help="device for the task camera")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--output", type=Path, default=RESULTS / "peers.csv")
     args = parser.parse_args(arguments)

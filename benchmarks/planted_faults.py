@@ -1,9 +1,9 @@
-"""Faults to plant in HAVE's formulas, one at a time: what a check of the formulas has to notice.
+"""Faults to plant in HAVE's formulas, one at a time, which a check of the formulas has to find.
 
     with FAULTS["swapped_modalities"]():
-        ...  # every HAVESAC built and trained in here has the fault
+        ...  # every HAVESAC that is created and trained here has the fault
 
-Each is a context manager that patches a method of the package and takes the patch away again.
+Each fault is a context manager that patches a method of the package and restores it at the end.
 """
 
 from __future__ import annotations
@@ -154,12 +154,12 @@ def _together(*contexts: Callable[[], AbstractContextManager[object]]) -> Iterat
 
 def _edited(owner: type, name: str, edit: Edit) -> AbstractContextManager[None]:
     """
-    A method whose arguments, and whose model for the time of the call, are edited.
+    Patch a method so that its arguments, and its model during the call, are edited.
 
-    :param owner: the class
-    :param name: of the method
-    :param edit: called with the model and the arguments by name, which it may change; the method runs within the
-        context that it returns
+    :param owner: The class
+    :param name: Name of the method
+    :param edit: Function of the model and the arguments by name, which it may change. The method runs in the context
+        that it returns.
     """
     method = getattr(owner, name)
 

@@ -1,16 +1,16 @@
-"""What the figures of the reliability benchmark stand between: its floor, its ceiling, and how far its runs differ.
+"""Compute the lower and upper limits of the reliability benchmark, and the differences between its methods.
 
     python -m benchmarks.reliability_facts
 
-Nothing is trained. In the episodes of the benchmark's evaluation, on its standard task, drive: nobody (action zero),
-81 constant actions, and a rule that is told the true state. While the rule drives, the observations show how easily
-failures are told by hand: by how far the second half of a modality's observation, the liveliness of its numbers, is in
-the mean from what is usual. From the rows that ``python -m benchmarks.reliability`` has left: the mean of "have" less
-that of every other method, with a 95% bootstrap interval over seeds, of the shares of the return that are kept under a
-failure, of the returns under a failure, and of the weights as detectors.
+This script does not train. In the evaluation episodes of the standard task it runs the action zero, 81 constant
+actions, and a rule that knows the true state. While the rule drives, the script measures how well a simple feature
+detects failures: the mean deviation of the second half of a modality's observation, the liveliness of its numbers, from
+its usual value. From the results of ``python -m benchmarks.reliability`` it computes the differences between "have" and
+every other method, with a 95% bootstrap interval over seeds, in the shares of the return kept under a failure, in the
+returns under a failure, and in the AUC of the weights as detectors.
 
-Rows, printed and written to benchmarks/results/reliability/facts.csv: ``fact``, ``than`` (the other method), ``value``,
-``lower`` and ``upper``.
+It prints and writes to benchmarks/results/reliability/facts.csv the columns ``fact``, ``than`` (the other method),
+``value``, ``lower`` and ``upper``.
 """
 
 from __future__ import annotations
@@ -32,26 +32,26 @@ from sb3_have.envs.reliability_drive import ACROSS, ALONG, CHANNELS, DRAG, DT, D
 from sb3_have.evaluation.evaluation import mean, stratified_bootstrap
 
 Row = dict[str, Any]
+# A function from the drives, including their true state, to actions (N, 2)
 Policy = Callable[[DriveBatch], Floats]
-"""From the drives, their true state included, to actions (N, 2)."""
 NOTHING = "return of doing nothing"
+# Number of values of throttle and of steering, from -1 to 1, denser around 0
 N_CONSTANTS = 9
-"""Values of throttle and of steering, from -1 to 1, closer to each other about 0."""
+# Lateral distance at which the rule passes the obstacle [m]
 ROOM = 3.0
-"""Distance across the road [m] at which the rule passes the obstacle."""
+# Largest distance of the rule from the middle of the road [m]
 WIDEST = 3.5
-"""How far from the middle of the road [m] it goes for that."""
+# Range of distances along the road where the rule considers the obstacle [m]
 AHEAD = (-4.0, 14.0)
-"""Distances along the road [m] between which the obstacle counts."""
 
 
 def constant(throttle: float, steering: float) -> Policy:
-    """Always the same action."""
+    """Create a policy that always takes the same action."""
     return lambda batch: np.tile([throttle, steering], (batch.num_envs, 1))
 
 
 def rule(batch: DriveBatch) -> Floats:
-    """Holds the speed to hold and the middle of the road, and goes round the obstacle on the side with more room."""
+    """Hold the target speed and the middle of the road, and pass the obstacle on the side with more room."""
     throttle = (batch.target_speed(batch.s + DT * batch.speed) - batch.speed) / (DT * ALONG)
     distance, offset, _ = batch.obstacle_position()
     obstacle = batch.y + offset
@@ -64,13 +64,13 @@ def rule(batch: DriveBatch) -> Floats:
 
 
 def liveliness(batch: DriveBatch) -> Floats:
-    """(N, d): the higher, the more does the liveliness of a modality look like that of a sound one."""
+    """Score each modality (N, d): the higher, the more its liveliness is that of a working sensor."""
     scores: Floats = -np.abs(batch.frames[:, :, CHANNELS:].mean(axis=2))
     return scores
 
 
 def drive(policy: Policy, n_episodes: int = N_EPISODES, **task: Any) -> Drive:
-    """Whole episodes, those of the benchmark's evaluation; in the place of the weights is :func:`liveliness`."""
+    """Run the episodes of the benchmark's evaluation, with :func:`liveliness` in place of the weights."""
     env = ReliabilityDriveVecEnv(n_episodes, n_modalities=N_MODALITIES, **task)
     env.seed(EVALUATION_SEED)
     env.reset()
@@ -85,7 +85,7 @@ def drive(policy: Policy, n_episodes: int = N_EPISODES, **task: Any) -> Drive:
 
 
 def drivers() -> list[Row]:
-    """What those earn who were not trained, and the rule that tells failures."""
+    """Compute the returns of policies that were not trained, and the AUC of the liveliness."""
 
     def earned(policy: Policy) -> float:
         return float(drive(policy, **STANDARD_TASK).returns.mean())
@@ -104,7 +104,7 @@ def drivers() -> list[Row]:
 
 
 def floors(rows: pd.DataFrame, floor: float) -> list[Row]:
-    """What doing nothing earns, as a share of each method's return with sound sensors."""
+    """Compute the return of doing nothing as a share of each method's return with working sensors."""
     returns = rows[rows["measure"] == "clean_return"].groupby("method", sort=False)["value"].mean()
     fact = "doing nothing: share of the clean return of"
     return [{"fact": fact, "than": method, "value": floor / clean} for method, clean in returns.items()]
@@ -112,9 +112,10 @@ def floors(rows: pd.DataFrame, floor: float) -> list[Row]:
 
 def differences(rows: pd.DataFrame) -> list[Row]:
     """
-    Of each measure, the mean of "have" less that of each other method that has it.
+    Compute the difference in each measure between "have" and every other method that has it, mean over seeds.
 
-    :param rows: method, seed, updates, measure, value
+    :param rows: Rows with method, seed, updates, measure and value
+    :return: Rows of the table
     """
     facts = []
     for method in rows["method"].unique():
@@ -130,7 +131,7 @@ def differences(rows: pd.DataFrame) -> list[Row]:
 
 
 def measures(rows: pd.DataFrame, method: str) -> dict[str, pd.Series[float]]:
-    """A number per seed of each measure that is compared."""
+    """Get the values per seed of each measure that is compared."""
     clean = values(rows, method, "clean_return")
     kept = {name: values(rows, method, name) for name in KEPT}
     returns = {f"return under {name.removeprefix('kept_')}": share * clean for name, share in kept.items()}

@@ -1,4 +1,4 @@
-"""Statistics of the runs of the reliability benchmark, as a Markdown page."""
+"""Format the statistics of the reliability benchmark as a Markdown page."""
 
 from __future__ import annotations
 
@@ -26,10 +26,12 @@ KEPT = ("kept_black", "kept_frozen", "kept_noise")
 
 def report(rows: pd.DataFrame, methods: Sequence[str]) -> str:
     """
-    :param rows: method, seed, updates, measure, value
-    :param methods: to tell of, in the order of the tables; those without rows are left out
-    :return: tables of the scores (interquartile mean over seeds), of the probability that a run of "have" is better
-        than one of another method, and of the other measures (mean over seeds), with 95% bootstrap intervals
+    Format tables of the scores (interquartile mean over seeds), of the probability that a run of "have" is better than
+    one of another method, and of the other measures (mean over seeds), with 95% bootstrap intervals.
+
+    :param rows: Rows with method, seed, updates, measure and value
+    :param methods: Methods in the order of the tables; those without rows are skipped
+    :return: The Markdown text
     """
     there = set(rows["method"])
     methods = [method for method in dict.fromkeys(methods) if method in there]
@@ -61,7 +63,7 @@ def report(rows: pd.DataFrame, methods: Sequence[str]) -> str:
 
 
 def values(rows: pd.DataFrame, method: str, measure: str) -> pd.Series[float]:
-    """Of one measure, a number per seed, without seeds where the method has none."""
+    """Get the values of a measure per seed, without seeds where it is missing."""
     chosen = rows[(rows["method"] == method) & (rows["measure"] == measure)]
     return chosen.set_index("seed")["value"].astype(float).dropna().sort_index()
 
@@ -82,7 +84,7 @@ def _improvement(rows: pd.DataFrame, method: str, measure: str) -> str:
 
 
 def _lead(rows: pd.DataFrame, method: str, measure: str) -> str:
-    """By how much the returns under a failure of the reference are above those of a method, mean over seeds."""
+    """Compute the lead of the reference over a method in the return under a failure, mean over seeds."""
     ours, other = (
         (values(rows, name, measure) * values(rows, name, "clean_return")).to_numpy()[:, None]
         for name in (REFERENCE, method)
@@ -97,5 +99,5 @@ def _format(result: Interval, digits: int) -> str:
 
 
 def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Lines of a Markdown table."""
+    """Format the lines of a Markdown table."""
     return ["| " + " | ".join(cells) + " |" for cells in [header, ["---"] * len(header), *rows]]

@@ -1,4 +1,4 @@
-"""One run of the reliability benchmark: a method is trained on ReliabilityDrive-v0 by HAVESAC, and measured."""
+"""One run of the reliability benchmark: train a method with HAVESAC on ReliabilityDrive-v0 and measure it."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from benchmarks.reliability_vec_env import ReliabilityDriveVecEnv
 from sb3_have import HAVESAC
 from sb3_have.envs.reliability_drive import CONDITIONS
 
+# Arguments of HAVESAC per method; all others are the same
 METHODS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
         "gve": {"value_estimation": "gve"},
@@ -30,7 +31,7 @@ METHODS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "gve-wide-dropout": {"value_estimation": "gve", "modality_dropout": 0.2},
     }
 )
-"""Arguments of HAVESAC by method; all others are the same for all methods."""
+# Other settings, for benchmarks/STUDY.md
 VARIANTS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
         "have-coef-0.25": {"local_coef": 0.25},
@@ -40,7 +41,7 @@ VARIANTS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "lve-dropout": {"value_estimation": "lve", "modality_dropout": 0.2},
     }
 )
-"""Other settings, for ``benchmarks/STUDY.md``."""
+# Variants whose results are kept; their code was removed after commit 16a9471, because they showed no gain
 REMOVED = (
     "have-min-before",
     "have-detached-keys",
@@ -49,13 +50,12 @@ REMOVED = (
     "have-residual",
     "have-competing",
 )
-"""Forms of HAVE whose results are kept, while their code went after commit 16a9471: it showed no gain."""
 N_MODALITIES = 3
 N_ENVS = 8
+# Updates per step of all environments
 UPDATES_PER_STEP = 4
-"""Updates for each step of all environments."""
+# Steps of all environments with random actions
 WARM_UP = 100
-"""Steps of all environments by random actions."""
 WIDTH = 64
 HYPERPARAMETERS: Mapping[str, Any] = MappingProxyType(
     {
@@ -73,8 +73,8 @@ HYPERPARAMETERS: Mapping[str, Any] = MappingProxyType(
     }
 )
 N_EVALUATIONS = 8
+# Episodes of an evaluation, which run at once and are the same for every method and training seed
 N_EPISODES = 24
-"""Episodes of an evaluation, all at once, the same for every method and seed of training."""
 EVALUATION_SEED = 1_000_000
 N_GRADIENT_SAMPLES = 2000
 FAILURES = CONDITIONS[1:]
@@ -82,34 +82,37 @@ FAILURES = CONDITIONS[1:]
 
 @dataclass
 class Drive:
-    """Episodes of one policy: S steps each of N drives; what comes after an episode's end is masked."""
+    """
+    N episodes of a policy with S steps each; steps after the end of an episode are masked.
+
+    :param rewards: Rewards, 0 after the end, (S, N)
+    :param alive: Whether the step belongs to the episode, (S, N)
+    :param reliable: Whether each modality was reliable when the action was chosen, (S, N, d)
+    :param weights: Weights of the modalities, (S, N, d), or None if the method has none
+    """
 
     rewards: Floats
-    """(S, N), 0 after the end."""
     alive: NDArray[np.bool_]
-    """(S, N): whether the step belongs to the episode."""
     reliable: NDArray[np.bool_]
-    """(S, N, d), when the action was chosen."""
     weights: Floats | None
-    """(S, N, d), of the modalities, or None where the method has none."""
 
     @property
     def returns(self) -> Floats:
-        """(N,)."""
+        """Return of each episode, (N,)."""
         total: Floats = self.rewards.sum(axis=0)
         return total
 
     def weight_auc(self) -> float:
         """
-        The weights as detectors of sound modalities: the probability that a sound modality has a larger weight than a
-        failed one, each drawn from all steps of all episodes.
+        Compute the probability that a working modality has a larger weight than a failed one, each drawn from all steps
+        of all episodes.
         """
         if self.weights is None:
             return float("nan")
         return auc(self.weights[self.alive].ravel(), self.reliable[self.alive].ravel())
 
     def weight_auc_in_step(self) -> float:
-        """The same, of a sound and a failed modality of the same step."""
+        """Compute the same probability for a working and a failed modality in the same step."""
         if self.weights is None:
             return float("nan")
         weights, reliable = self.weights[self.alive], self.reliable[self.alive]
@@ -120,10 +123,13 @@ class Drive:
 
 def make_model(method: str, seed: int, task: Mapping[str, Any] | None = None, **kwargs: Any) -> HAVESAC:
     """
-    :param method: one of ``METHODS`` or ``VARIANTS``
-    :param seed: of networks, environments and exploration
-    :param task: options of the environment
-    :param kwargs: of HAVESAC, in place of the method's own
+    Create the model of a method.
+
+    :param method: One of ``METHODS`` or ``VARIANTS``
+    :param seed: Seed of networks, environments and exploration
+    :param task: Options of the environment
+    :param kwargs: Arguments of HAVESAC that replace those of the method
+    :return: The model
     """
     settings = {**HYPERPARAMETERS, **{**METHODS, **VARIANTS}[method], "policy_kwargs": policy_kwargs(WIDTH)}
     if method.startswith("gve-wide"):
@@ -133,19 +139,19 @@ def make_model(method: str, seed: int, task: Mapping[str, Any] | None = None, **
 
 
 def policy_kwargs(width: int) -> dict[str, Any]:
-    """Of HAVESAC's policy, with this width of the critics' hidden layers."""
+    """Create the policy arguments for a width of the critics' hidden layers."""
     return {"features_dim": 32, "net_arch": {"pi": [WIDTH, WIDTH], "qf": [width, width]}}
 
 
 def critic_size(width: int, value_estimation: str) -> int:
-    """Parameters of the encoders and critics with this width of the critics' hidden layers."""
+    """Count the parameters of encoders and critics for a width of the critics' hidden layers."""
     model = make_model("have", 0, value_estimation=value_estimation, policy_kwargs=policy_kwargs(width))
     return sum(parameter.numel() for parameter in model.critic.parameters())
 
 
 @cache
 def gve_width() -> int:
-    """Width of the hidden layers with which a global critic alone has as many parameters as HAVE's, within 1%."""
+    """Find the width at which a global critic alone has as many parameters as all critics of HAVE, within 1%."""
     wanted = critic_size(WIDTH, "have")
     low, high = WIDTH, 16 * WIDTH
     while low < high:
@@ -164,22 +170,22 @@ def run(
     evaluation_seed: int = EVALUATION_SEED,
 ) -> dict[str, float]:
     """
-    Trains one method and measures it.
+    Train a method and measure it.
 
-    :param method: one of ``METHODS`` or ``VARIANTS``
-    :param seed: of the training; the episodes of the evaluations are the same for all
-    :param n_updates: of the critic
-    :param task: options of the environment, ``n_blind`` and ``corruption``
-    :param hyperparameters: in the place of those of ``HYPERPARAMETERS``, e.g. ``{"learning_rate": 3e-4}``
-    :param evaluation_seed: of the episodes that the learning curve is made of
-    :return: measures by name, NaN where a method has no such part:
-        ``return_<n>`` mean return after n updates, ``final_return`` the last of them and ``area`` their mean;
+    :param method: One of ``METHODS`` or ``VARIANTS``
+    :param seed: Seed of the training; the evaluation episodes are the same for all
+    :param n_updates: Number of updates of the critic
+    :param task: Options of the environment, ``n_blind`` and ``corruption``
+    :param hyperparameters: Changes of ``HYPERPARAMETERS``, e.g. ``{"learning_rate": 3e-4}``
+    :param evaluation_seed: Seed of the episodes of the learning curve
+    :return: Measures by name, NaN where a method has no such part:
+        ``return_<n>``, the mean return after n updates, ``final_return``, the last one, and ``area``, their mean;
         ``weight_auc`` and ``weight_auc_in_step``, see :class:`Drive`;
-        ``value_bias`` and ``value_correlation``, see :func:`value_errors`; ``negative_gradient``, see there, of
-        transitions from the replay buffer;
-        ``clean_return`` with all modalities sound, and ``kept_black``, ``kept_frozen``, ``kept_noise``, the share of it
-        that is left when one modality fails so for whole episodes, mean over the modalities;
-        ``parameters`` of encoders and critics
+        ``value_bias`` and ``value_correlation``, see :func:`value_errors`;
+        ``negative_gradient`` on transitions from the replay buffer, see :func:`benchmarks.known_q.negative_gradient`;
+        ``clean_return`` with all modalities working, and ``kept_black``, ``kept_frozen`` and ``kept_noise``, the share
+        of it that remains when one modality fails for whole episodes, mean over the modalities;
+        ``parameters``, the number of parameters of encoders and critics
     """
     th.set_num_threads(1)
     task = dict(task or {})
@@ -204,12 +210,13 @@ def run(
 
 def evaluate(model: HAVESAC, n_episodes: int = N_EPISODES, seed: int = EVALUATION_SEED, **options: Any) -> Drive:
     """
-    Drives whole episodes by the mode of the policy.
+    Run whole episodes with deterministic actions.
 
-    :param model: trained with ``N_MODALITIES`` modalities
-    :param n_episodes: side by side
-    :param seed: of the first, the next ones count on
-    :param options: of the environment, e.g. ``failure``
+    :param model: Model that was trained with ``N_MODALITIES`` modalities
+    :param n_episodes: Number of episodes, which run in parallel
+    :param seed: Seed of the first episode; the others have the following seeds
+    :param options: Options of the environment, e.g. ``failure``
+    :return: The episodes
     """
     env = ReliabilityDriveVecEnv(n_episodes, n_modalities=N_MODALITIES, **options)
     env.seed(seed)
@@ -232,7 +239,7 @@ def evaluate(model: HAVESAC, n_episodes: int = N_EPISODES, seed: int = EVALUATIO
 
 
 def kept_returns(model: HAVESAC, **options: Any) -> dict[str, float]:
-    """``clean_return``, and for each kind of failure the share of it that is kept, see :func:`run`."""
+    """Compute ``clean_return``, and the share of it that is kept under each kind of failure, see :func:`run`."""
     options = {**options, "corruption": 0.0}
     clean = float(evaluate(model, **options).returns.mean())
     measures = {"clean_return": clean}
@@ -248,13 +255,17 @@ def value_errors(
     model: HAVESAC, n_episodes: int = N_EPISODES, n_steps: int = 200, **options: Any
 ) -> tuple[float, float]:
     """
-    The critic against Monte-Carlo returns of the policy that it evaluates, the stochastic one with its entropy:
+    Compare the critic with Monte-Carlo returns of the stochastic policy, including its entropy:
     G_t = r_t + gamma (1 - end_t) (G_{t+1} - alpha log pi(a_{t+1})).
 
-    Of episodes of up to 2 ``n_steps`` steps the first half counts. Where they are cut, G is the critic's own value,
-    which enters what counts by gamma^n_steps (0.02).
+    The episodes have up to 2 ``n_steps`` steps, and the first ``n_steps`` count. G is the critic's own value where an
+    episode is cut, which contributes with a factor of gamma^n_steps (0.02).
 
-    :return: bias, the mean of min_k Q_k - G over the standard deviation of G, and Pearson's correlation
+    :param model: The model
+    :param n_episodes: Number of episodes
+    :param n_steps: Number of steps that count
+    :param options: Options of the environment
+    :return: Bias, the mean of min_k Q_k - G divided by the standard deviation of G, and Pearson's correlation
     """
     env = ReliabilityDriveVecEnv(n_episodes, n_modalities=N_MODALITIES, max_episode_steps=2 * n_steps + 1, **options)
     env.seed(EVALUATION_SEED)

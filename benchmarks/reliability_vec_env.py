@@ -1,4 +1,4 @@
-"""Many drives of ReliabilityDrive-v0 at once, as one SB3 environment: one batch of arrays instead of N environments."""
+"""ReliabilityDrive-v0 as a vectorized SB3 environment on one batch of arrays instead of N environments."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,11 +14,11 @@ from sb3_have.envs.reliability_drive import DriveBatch
 
 class ReliabilityDriveVecEnv(VecEnv):
     """
-    Equal, step for step and bit for bit, to a ``DummyVecEnv`` of as many :class:`ReliabilityDriveEnv`, and several
+    Vectorized environment that is bit for bit equal to a ``DummyVecEnv`` of :class:`ReliabilityDriveEnv`, but several
     times faster.
 
-    :param num_envs: number of environments
-    :param options: of :class:`DriveBatch`
+    :param num_envs: Number of environments
+    :param options: Options of :class:`DriveBatch`
     """
 
     def __init__(self, num_envs: int, **options: Any):
@@ -62,10 +62,10 @@ class ReliabilityDriveVecEnv(VecEnv):
         return [value for _ in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        raise NotImplementedError(f"cannot set {attr_name!r}: give the batch its options when it is made.")
+        raise NotImplementedError(f"cannot set {attr_name!r}; pass the options to the constructor")
 
     def env_method(self, method_name: str, *args: Any, indices: VecEnvIndices = None, **kwargs: Any) -> list[Any]:
-        raise NotImplementedError(f"no method {method_name!r} of single environments: they are one batch.")
+        raise NotImplementedError(f"cannot call {method_name!r}, because the environments are one batch")
 
     def env_is_wrapped(
         self, wrapper_class: type[gym.Wrapper[Any, Any, Any, Any]], indices: VecEnvIndices = None

@@ -1,21 +1,22 @@
-"""Memory and speed of ModalityReplayBuffer beside SB3's DictReplayBuffer, on stacked colour and event images.
+"""Measure memory and speed of ModalityReplayBuffer and SB3's DictReplayBuffer on stacked colour and event images.
 
     python -m benchmarks.replay_memory
 
-Both get the same random transitions, as SB3's agents give them (three stacked frames, zeros after a reset, the terminal
-observation at an episode's end), and are filled beyond their size, so that old transitions are overwritten. Rows,
-printed and written to benchmarks/results/replay_memory.csv, for each image size and episode length:
+Both buffers get the same random transitions, as from SB3's agents (three stacked frames, zeros after a reset, the
+terminal observation at the end of an episode), and are filled beyond their size, so that old transitions are
+overwritten. For each image size and episode length, the script prints and writes to
+benchmarks/results/replay_memory.csv:
 
-- ``bytes_per_transition``: growth of a fresh process's own memory (RssAnon of Linux) from before the buffer is made
-  until it is full and some of it overwritten, over the transitions it holds; pages of "mmap" files, which the system
-  can write back and drop, do not count;
-- ``held_per_transition``: size of all arrays that the buffer holds, files and reserve that was never touched included;
-- ``sample_*``: time of ``sample(batch_size)``, the contenders in turn: median, quartiles;
-- ``add_*``: time of ``add`` (one step of all environments) to the full buffer, likewise;
-- ``memory_vs_sb3`` (arrays held), ``sample_vs_sb3``, ``add_vs_sb3``: how many times less memory and time than SB3;
-  of times, the median over the rounds of the ratio within a round.
+- ``bytes_per_transition``: growth of a new process's own memory (RssAnon on Linux) from before the buffer is created
+  until some of it was overwritten, divided by the number of transitions it holds. Pages of "mmap" files do not count,
+  because the system can write them back and drop them;
+- ``held_per_transition``: size of all arrays in the buffer, including files and memory that was never touched;
+- ``sample_*``: time of ``sample(batch_size)``, median and quartiles, with the contenders in turn;
+- ``add_*``: time of ``add`` (one step of all environments) to the full buffer, median and quartiles;
+- ``memory_vs_sb3`` (of the arrays), ``sample_vs_sb3``, ``add_vs_sb3``: how many times less memory and time than SB3.
+  Ratios of times are medians over the rounds of the ratio within a round.
 
-The buffers are small enough for the page cache: what reading a "mmap" buffer larger than memory costs is not measured.
+The buffers fit into the page cache. The cost of reading a "mmap" buffer that is larger than memory is not measured.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ GROUP = ("image_size", "episode_length", "n_envs")
 
 
 class Setting(NamedTuple):
-    """What the buffers get: image size in pixels, episode length in steps, environments, size in transitions."""
+    """Image size in pixels, episode length in steps, number of environments, size of the buffers in transitions."""
 
     image_size: int
     episode_length: int
@@ -64,7 +65,7 @@ class Setting(NamedTuple):
 
 
 def filled(name: str, setting: Setting) -> ReplayBuffer:
-    """The buffer of this name, filled a quarter beyond its size."""
+    """Create a buffer and add a quarter more transitions than it holds."""
     env = setting.env()
     buffer_class, kwargs = BUFFERS[name]
     if kwargs.get("storage") == "mmap":
@@ -77,8 +78,8 @@ def filled(name: str, setting: Setting) -> ReplayBuffer:
 
 
 def own_growth(name: str, setting: Setting) -> int | None:
-    """Bytes by which :func:`own_memory` grows when the buffer is made and filled."""
-    filled(name, setting._replace(transitions=8))  # what the first use of everything takes is not the buffer's
+    """Compute by how many bytes :func:`own_memory` grows when the buffer is created and filled."""
+    filled(name, setting._replace(transitions=8))  # memory that the first use of the code takes is not the buffer's
     before = own_memory()
     buffer = filled(name, setting)
     after = own_memory()
@@ -87,7 +88,7 @@ def own_growth(name: str, setting: Setting) -> int | None:
 
 
 def own_memory() -> int | None:
-    """Bytes of this process in memory that belong to no file; None where the system does not say."""
+    """Get the bytes in memory of this process that belong to no file; None if the system does not report them."""
     status = Path("/proc/self/status")
     if status.exists():
         for line in status.read_text().splitlines():
@@ -97,7 +98,7 @@ def own_memory() -> int | None:
 
 
 def arrays(thing: object) -> Iterator[np.ndarray | th.Tensor]:
-    """Every array that an object holds, in attributes, dicts and lists, however deep."""
+    """Iterate over all arrays of an object, in nested attributes, dicts and lists."""
     if isinstance(thing, (np.ndarray, th.Tensor)):
         yield thing
     elif isinstance(thing, Mapping):
@@ -114,17 +115,18 @@ def measure(
     setting: Setting, names: Sequence[str] = tuple(BUFFERS), batch_size: int = 128, rounds: int = 50
 ) -> list[Row]:
     """
-    One row for every buffer.
+    Measure the buffers.
 
-    :param setting: what the buffers get
-    :param names: of the buffers, SB3's among them
-    :param batch_size: of the samples
-    :param rounds: timed samples of each buffer, and timed additions
+    :param setting: Images, episodes and size of the buffers
+    :param names: Names of the buffers, including SB3's
+    :param batch_size: Batch size of the samples
+    :param rounds: Number of timed samples, and of timed additions, per buffer
+    :return: One row per buffer
     """
     buffers = {name: filled(name, setting) for name in names}
     rows: dict[str, Row] = {}
     for name, buffer in buffers.items():
-        with get_context("spawn").Pool(1) as fresh_process:  # a used one has memory to fill first
+        with get_context("spawn").Pool(1) as fresh_process:  # a used one would fill free memory first
             growth = fresh_process.apply(own_growth, (name, setting))
         n_transitions = buffer.size() * setting.n_envs
         rows[name] = {

@@ -1,11 +1,11 @@
-"""Is the driving task of HighwayVision-v0 learnable at all, and which choices decide it? No pixels: a state vector.
+"""Test whether the driving task of HighwayVision-v0 can be learned, and with which settings, from a state vector.
 
     python -m benchmarks.state_learnability drivers                                # drivers that do not learn
     python -m benchmarks.state_learnability drivers --scenarios merge curves       # the same on other roads
     python -m benchmarks.state_learnability train --settings default --seeds 0 1   # stock SAC, two seeds at a time
 
-Every evaluation is appended to ``benchmarks/results/state_learnability.csv`` as it is made; the name of a setting
-begins with that of the scenario where it is not the highway.
+Every evaluation is appended to ``benchmarks/results/state_learnability.csv`` at once. The name of a setting starts with
+the scenario, unless it is the highway.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from sb3_have.envs.road_shape import SCENARIOS
 RESULTS = Path(__file__).parent / "results" / "state_learnability.csv"
 COLUMNS = ["setting", "seed", "step", "episodes", "distance_mean", "distance_std", "distance_max"]
 COLUMNS += ["return_mean", "crash_share", "offroad_share", "seconds"]
+# Range within which the state vector reports other vehicles [m]
 SEEN = 150.0
-"""How far the state vector reports other vehicles [m]."""
 
 SAC_DEFAULTS: dict[str, Any] = {
     "gamma": 0.98,
@@ -62,9 +62,12 @@ SETTINGS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
 
 
 class StateObservation(ObservationType):  # type: ignore[misc]  # highway-env is untyped
-    """19 values: own lateral position, offset from the lane's centre, heading and speed, and for the lane to the left,
-    the own and the one to the right: whether it exists, gap and speed difference to the next vehicle ahead and behind.
-    All relative to the road; lanes are those in one direction.
+    """
+    State vector of 19 values relative to the road.
+
+    These are lateral position, offset from the centre of the lane, heading and speed of the ego vehicle, and for the
+    left lane, the own lane and the right lane: whether it exists, and the gap and speed difference to the next vehicle
+    ahead and behind. Only lanes in the ego vehicle's direction count.
     """
 
     def space(self) -> spaces.Box:
@@ -90,7 +93,7 @@ class StateObservation(ObservationType):  # type: ignore[misc]  # highway-env is
 
 
 class StateEnv(HighwayVisionEnv):
-    """The dynamics and the reward of HighwayVision-v0, seen as a state vector; nothing is rendered."""
+    """HighwayVision-v0 with a state vector as its observation; nothing is rendered."""
 
     def define_spaces(self) -> None:
         super().define_spaces()
@@ -99,14 +102,14 @@ class StateEnv(HighwayVisionEnv):
 
 
 class RuleBasedEnv(RuleDrivenEnv, StateEnv):
-    """An IDM/MOBIL driver at the wheel, and nothing rendered."""
+    """The same environment with an IDM/MOBIL driver."""
 
 
 Driver = Callable[[np.ndarray], np.ndarray]
 
 
 def keep_straight(speed: float) -> Driver:
-    """No steering, a proportional controller on the throttle. :param speed: [m/s]"""
+    """Create a driver that goes straight at a speed [m/s], with a proportional controller on the throttle."""
     return lambda state: np.array([np.clip((speed - 15 * (state[3] + 1)) / 3, -1, 1), 0.0])
 
 
@@ -114,7 +117,7 @@ def evaluate(env: HighwayVisionEnv, driver: Driver, seeds: Iterable[int]) -> dic
     """Drive one episode per seed."""
     distances, returns, reasons = [], [], []
     for seed in seeds:
-        state: Any  # the sensors' Dict in general, a vector here
+        state: Any  # a vector here, a Dict in the base class
         state, info = env.reset(seed=seed)
         done, total = False, 0.0
         while not done:
@@ -148,7 +151,7 @@ def record(row: dict[str, Any], path: Path) -> None:
 
 
 def run_drivers(scenario: str, path: Path, episodes: int) -> None:
-    """Drivers that do not learn."""
+    """Evaluate drivers that do not learn."""
     rng = np.random.default_rng(0)
     drivers: dict[str, tuple[type[StateEnv], Driver]] = {
         "random": (StateEnv, lambda state: rng.uniform(-1, 1, 2)),
@@ -164,7 +167,7 @@ def run_drivers(scenario: str, path: Path, episodes: int) -> None:
 
 
 def train(setting: str, seed: int, steps: int, every: int, episodes: int, path: Path) -> None:
-    """Stock SAC on the state vector, evaluated every so many steps."""
+    """Train SB3's SAC on the state vector and evaluate it every ``every`` steps."""
     th.set_num_threads(1)
     env_kwargs, sac_kwargs = SETTINGS[setting]
     model = SAC("MlpPolicy", StateEnv(**env_kwargs), seed=seed, device="cpu", **{**SAC_DEFAULTS, **sac_kwargs})
@@ -184,13 +187,13 @@ def train(setting: str, seed: int, steps: int, every: int, episodes: int, path: 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", choices=["drivers", "train"])
-    parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=["highway"], help="for drivers")
+    parser.add_argument("--scenarios", nargs="+", choices=SCENARIOS, default=["highway"], help="scenarios for drivers")
     parser.add_argument("--settings", nargs="+", choices=list(SETTINGS), default=["default"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
     parser.add_argument("--steps", type=int, default=20_000)
     parser.add_argument("--every", type=int, default=2_500)
-    parser.add_argument("--episodes", type=int, default=None, help="per evaluation; 20 for drivers, 10 in training")
-    parser.add_argument("--jobs", type=int, default=2, help="runs side by side")
+    parser.add_argument("--episodes", type=int, default=None, help="default: 20 for drivers, 10 in training")
+    parser.add_argument("--jobs", type=int, default=2, help="number of parallel runs")
     parser.add_argument("--out", type=Path, default=RESULTS)
     args = parser.parse_args()
     if args.what == "drivers":

@@ -1,14 +1,14 @@
-"""Whether the formulas of HAVE still hold, in minutes: bounds on what small trainings measure.
+"""Check the formulas of HAVE in minutes, with bounds on the measures of short training runs.
 
     OMP_NUM_THREADS=1 python -m benchmarks.study_quick                                # exit code 1 if out of bounds
-    OMP_NUM_THREADS=1 python -m benchmarks.study_quick --fault swapped_modalities     # a planted fault: has to fail
-    OMP_NUM_THREADS=1 python -m benchmarks.study_quick --record                       # sound code, and every fault
+    OMP_NUM_THREADS=1 python -m benchmarks.study_quick --fault swapped_modalities     # has to fail
+    OMP_NUM_THREADS=1 python -m benchmarks.study_quick --record                       # correct code, and every fault
 
-The default form of HAVE learns a known Q (``benchmarks.known_q``) and, if that is within bounds, to drive on
-ReliabilityDrive-v0 (``benchmarks.reliability``), in two processes. The worst seed of each measure counts; of the
-return, which varies most, the mean of the seeds does, and one that does nothing (59.4) is out of bounds. ``--record``
-does so for several sets of seeds of the sound code and for every fault of ``benchmarks.planted_faults``, and writes
-``benchmarks/results/study_quick/faults.csv`` and ``faults.md``, with what was printed.
+The default form of HAVE learns a known Q-function (``benchmarks.known_q``) and, if that is within bounds, to drive on
+ReliabilityDrive-v0 (``benchmarks.reliability``), in two processes. The worst seed of each measure counts, except for
+the return, which varies most: its mean over the seeds counts, and doing nothing (59.4) is out of bounds. ``--record``
+repeats the check for several sets of seeds with correct code and for every fault of ``benchmarks.planted_faults``, and
+writes the output to ``benchmarks/results/study_quick/faults.csv`` and ``faults.md``.
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ from benchmarks.planted_faults import FAULTS
 from sb3_have.benchmark.machine import machine
 
 SEEDS = (0, 1, 2, 3)
+# Number of seeds that learn to drive
 N_DRIVES = 2
-"""Of the seeds, how many learn to drive."""
+# Seeds of the record: all of them for correct code, the first pair for the faults
 RECORD_SEEDS = ((0, 1), (2, 3), (4, 5))
-"""Of the record: all for the sound code, the first for the faults."""
 DRIVE_UPDATES = 2000
 RECORD = RESULTS / "study_quick"
 SOUND = "sound"
@@ -42,17 +42,24 @@ N_PROCESSES = 2
 
 
 class Bound(NamedTuple):
-    """What a measure has to be in every seed, or on average, and where to look if it is not."""
+    """
+    Bounds of a measure.
+
+    :param measure: Name of the measure
+    :param lower: Lower bound
+    :param upper: Upper bound
+    :param suspects: Where to look if the measure is out of bounds
+    :param of_mean: Whether the bounds are for the mean over the seeds, not for every seed
+    """
 
     measure: str
     lower: float
     upper: float
     suspects: str
     of_mean: bool = False
-    """Whether the mean over the seeds is bounded rather than each of them."""
 
     def excess(self, value: float) -> float:
-        """How far a value is out of bounds; within them, a negative distance to the nearer one."""
+        """Compute by how much a value is out of bounds; negative within the bounds."""
         return max(self.lower - value, value - self.upper) if math.isfinite(value) else math.inf
 
 
@@ -76,20 +83,28 @@ SUITES = {"known Q": KNOWN_Q, "driving": DRIVING}
 
 
 class Verdict(NamedTuple):
-    """A measure against its bounds."""
+    """
+    Result of the comparison of a measure with its bounds.
+
+    :param suite: One of ``SUITES``
+    :param bound: The bounds
+    :param worst: Value of the worst seed, or the mean over the seeds if the bounds are for the mean
+    :param ok: Whether the value is within the bounds
+    """
 
     suite: str
     bound: Bound
     worst: float
-    """The value of the seed that is furthest out, or the mean over the seeds where the bound is of that."""
     ok: bool
 
 
 def judge(suite: str, measured: Sequence[Mapping[str, float]]) -> list[Verdict]:
     """
-    :param suite: one of ``SUITES``
-    :param measured: measures by name, of each seed
-    :return: one verdict for each bound; NaN and infinity are out of any bounds
+    Compare measures with their bounds.
+
+    :param suite: One of ``SUITES``
+    :param measured: Measures by name, for each seed
+    :return: One verdict per bound; NaN and infinity are always out of bounds
     """
     bounds = SUITES[suite]
     verdicts = []
@@ -101,7 +116,7 @@ def judge(suite: str, measured: Sequence[Mapping[str, float]]) -> list[Verdict]:
 
 
 def describe(verdicts: Sequence[Verdict]) -> str:
-    """The verdicts as a table, and a line for each that is out of bounds."""
+    """Format the verdicts as a table, with a line for each one that is out of bounds."""
     lines = [f"{'suite':10}{'measure':20}{'worst seed':>12}   {'bounds':16}ok"]
     failures = []
     for suite, bound, worst, ok in verdicts:
@@ -115,10 +130,11 @@ def describe(verdicts: Sequence[Verdict]) -> str:
 
 def learn_known_q(seed: int, fault: str | None = None) -> dict[str, float]:
     """
-    Measures of one seed; runs in a process of its own.
+    Measure one seed of the known Q-function, in a process of its own.
 
-    :param seed: of everything
-    :param fault: one of ``FAULTS`` to plant, or None
+    :param seed: Seed of everything
+    :param fault: One of ``FAULTS`` to plant, or None
+    :return: Measures by name
     """
     th.set_num_threads(1)
     with nullcontext() if fault is None else FAULTS[fault]():
@@ -126,7 +142,7 @@ def learn_known_q(seed: int, fault: str | None = None) -> dict[str, float]:
 
 
 def learn_to_drive(seed: int, fault: str | None = None) -> dict[str, float]:
-    """As :func:`learn_known_q`, on ReliabilityDrive-v0."""
+    """Measure one seed on ReliabilityDrive-v0, see :func:`learn_known_q`."""
     th.set_num_threads(1)
     with nullcontext() if fault is None else FAULTS[fault]():
         row = reliability.run_small([seed], DRIVE_UPDATES, n_workers=1).iloc[0]
@@ -135,12 +151,15 @@ def learn_to_drive(seed: int, fault: str | None = None) -> dict[str, float]:
 
 def study(pool: Executor, seeds: Sequence[int] = SEEDS, fault: str | None = None) -> list[Verdict]:
     """
-    :param pool: where the trainings run
-    :param seeds: of the trainings
-    :param fault: one of ``FAULTS`` to plant, or None
+    Run the study.
+
+    :param pool: Pool of processes
+    :param seeds: Seeds of the training runs
+    :param fault: One of ``FAULTS`` to plant, or None
+    :return: The verdicts
     """
     verdicts = judge("known Q", list(pool.map(learn_known_q, seeds, [fault] * len(seeds))))
-    if all(verdict.ok for verdict in verdicts):  # else the longer runs would add nothing
+    if all(verdict.ok for verdict in verdicts):  # otherwise the longer runs would add nothing
         drivers = seeds[:N_DRIVES]
         verdicts += judge("driving", list(pool.map(learn_to_drive, drivers, [fault] * len(drivers))))
     return verdicts
@@ -148,12 +167,11 @@ def study(pool: Executor, seeds: Sequence[int] = SEEDS, fault: str | None = None
 
 def record(pool: Executor, names: Sequence[str]) -> bool:
     """
-    Runs studies, of two seeds each, and puts what they print in ``faults.csv`` and ``faults.md``, in place of what was
-    there of them.
+    Run studies of two seeds each and update their rows in ``faults.csv`` and ``faults.md``.
 
-    :param pool: where the trainings run
-    :param names: "sound", for the sound code with each of ``RECORD_SEEDS``, and faults with the first
-    :return: whether all sound studies passed and all faults were found
+    :param pool: Pool of processes
+    :param names: "sound" for correct code with each of ``RECORD_SEEDS``, and faults with the first pair
+    :return: Whether all studies of correct code passed and all faults were found
     """
     as_expected = True
     for name in names:
@@ -180,8 +198,10 @@ def record(pool: Executor, names: Sequence[str]) -> bool:
 
 def summary(table: pd.DataFrame) -> str:
     """
-    :param table: the rows of ``faults.csv``
-    :return: Markdown, with what each study printed
+    Format the output of each study as Markdown.
+
+    :param table: The rows of ``faults.csv``
+    :return: The Markdown text
     """
     bounds = {(suite, bound.measure): bound for suite, bounds in SUITES.items() for bound in bounds}
     studies: dict[tuple[str, str], list[dict[str, Any]]] = {}
@@ -209,14 +229,14 @@ def main() -> None:
         "--record",
         nargs="*",
         choices=[SOUND, *FAULTS],
-        help="write these studies down; by default the sound code and all",
+        help="record these studies; by default correct code and all faults",
     )
     args = parser.parse_args()
-    # Fresh processes: torch's threads do not survive a fork
+    # Spawn processes, because torch's threads do not survive a fork
     with ProcessPoolExecutor(N_PROCESSES, mp_context=get_context("spawn")) as pool:
         if args.record is not None:
             as_expected = record(pool, args.record or [SOUND, *FAULTS])
-            sys.exit(None if as_expected else "A sound study failed, or a fault was not found: see above.")
+            sys.exit(None if as_expected else "A study of correct code failed, or a fault was not found; see above")
         verdicts = study(pool, args.seeds, args.fault)
     print(describe(verdicts))
     failed = [f"{verdict.suite} {verdict.bound.measure}" for verdict in verdicts if not verdict.ok]

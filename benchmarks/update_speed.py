@@ -1,28 +1,30 @@
-"""Time of one gradient step of HAVESAC, beside SB3's SAC on equal encoders and beside the encoders alone.
+"""Measure a gradient step of HAVESAC, compared with SB3's SAC with equal encoders and with the encoders alone.
 
-    python -m benchmarks.update_speed                               # all; --shapes a for the quick part
+    python -m benchmarks.update_speed                               # everything; --shapes a is the quick part
     python -m benchmarks.update_speed --shapes b --device cuda      # on a GPU
 
-Shapes, all of three stacked frames: (a) 64x64 px, the Nature encoder, batch 64; (b) 128x128 px, the paper's encoder,
-batch 128. With 1, 2, 3 or 5 modalities: colour, events, depth, two more colour cameras. The contenders take turns in
-one process, in one thread by default. A unit is one ``train(gradient_steps=1)``, sampling included, in which critics,
-actor, temperature and target are updated. Rows, printed and written to benchmarks/results/update_speed.csv:
+There are two shapes with three stacked frames: (a) 64x64 px, the Nature encoder, batch 64; (b) 128x128 px, the paper's
+encoder, batch 128. The modalities are the first 1, 2, 3 or 5 of colour, events, depth and two more colour cameras. The
+contenders take turns in one process, on one thread by default. The unit is one ``train(gradient_steps=1)``, including
+sampling, with updates of critics, actor, temperature and target. The script prints and writes to
+benchmarks/results/update_speed.csv:
 
-- ``SB3 SAC``: MultiInputPolicy with DictReplayBuffer and encoders of the same layers for each key, in each network its
-  own; ``SB3 SAC shared``: the same with ``share_features_extractor=True``;
+- ``SB3 SAC``: MultiInputPolicy with DictReplayBuffer and encoders with the same layers for each key, separate for each
+  network; ``SB3 SAC shared``: the same with ``share_features_extractor=True``;
 - ``HAVESAC``: its defaults in the given precision; ``HAVESAC no auxiliary``: without DeepMDP;
-- ``encoders``: HAVESAC's encoders alone, forward and backward on observations and forward on next_observations, all
-  decoded beforehand: the floor of a step in that precision;
-- ``sampling`` and ``decoding`` (bytes to floats): the other parts of the step that feed the encoders;
+- ``encoders``: HAVESAC's encoders alone, forward and backward on observations and forward on next_observations, both
+  already decoded: the lower bound of a step in that precision;
+- ``sampling`` and ``decoding`` (bytes to floats): the other parts of the step before the encoders;
 - ``rest``: the step without these three: heads, losses, optimizers, target updates;
-- ``heads``: the same on its own, a step of HAVESAC on vectors in the features' place. What ``rest`` has more is the
-  encoders' part of optimizer and target update, and memory that the images have driven out of the caches.
+- ``heads``: the same measured separately, as a step of HAVESAC on vectors instead of encoded images. ``rest`` also
+  includes the encoders' share of optimizer and target update, and cache misses caused by the images.
 
-Columns: median and quartiles of the wall-clock time; ``cpu_ms``, median processor time; ``vs_sb3`` and
-``vs_sb3_shared``, how many times faster than SB3; ``vs_floor``, time over that of the encoders; ``share`` of HAVESAC's
-step. Ratios are medians over the rounds of the ratio within a round. On a GPU, ``gpu_share`` is the time of its kernels
-over the time of the step. ``options`` are those of the command line that change what is measured. One of them,
-``--retain-memory``, lets the C library keep freed memory: at large images page faults cost every contender time.
+The columns are median and quartiles of the wall-clock time; ``cpu_ms``, the median processor time; ``vs_sb3`` and
+``vs_sb3_shared``, how many times faster than SB3; ``vs_floor``, the time divided by that of the encoders; and
+``share``, the share of HAVESAC's step. Ratios are medians over the rounds of the ratio within a round. On a GPU,
+``gpu_share`` is the time of the kernels divided by the time of the step. ``options`` are the command line options that
+change what is measured. With ``--retain-memory`` the C library keeps freed memory, because page faults slow all
+contenders down with large images.
 """
 
 from __future__ import annotations
@@ -74,7 +76,7 @@ Contender = tuple[str, str]  # name, precision
 
 
 class Shape(NamedTuple):
-    """Image size in pixels, batch size, and by default the rounds and the numbers of modalities."""
+    """Image size in pixels, batch size, default number of rounds and default numbers of modalities."""
 
     image_size: int
     batch_size: int
@@ -86,7 +88,7 @@ SHAPES = {"a": Shape(64, 64, 30, (1, 2, 3, 5)), "b": Shape(128, 128, 7, (2,))}
 
 
 class PlainEncoders(BaseFeaturesExtractor):
-    """HAVESAC's default encoders as a user of SB3 writes them: the same layers for each key, concatenated."""
+    """HAVESAC's default encoders as an SB3 user would write them: the same layers for each key, concatenated."""
 
     def __init__(self, observation_space: spaces.Dict):
         super().__init__(observation_space, FEATURES_DIM * len(observation_space.spaces))
@@ -130,7 +132,7 @@ def have_sac(env: VecEnv, precision: str, device: str, encoder_classes: Any = No
 
 
 def ready(models: Sequence[SAC], env: VecEnv) -> None:
-    """Fill the first model's replay buffer and give it to the others: they train on the same data."""
+    """Fill the first model's replay buffer and share it, so that all models train on the same data."""
     buffer = models[0].replay_buffer
     assert buffer is not None
     for transition in transitions(env, BUFFER_SIZE):
@@ -141,14 +143,14 @@ def ready(models: Sequence[SAC], env: VecEnv) -> None:
 
 
 class NormOnly(nn.LayerNorm):
-    """Stands for an encoder where only what comes after it is timed."""
+    """Replacement for an encoder when only the parts after it are timed."""
 
     def __init__(self, observation_space: spaces.Box, features_dim: int):
         super().__init__(features_dim)
 
 
 class Features(gym.Env[Any, Any]):
-    """Only the spaces of an environment whose observations are features already."""
+    """The spaces of an environment whose observations are features."""
 
     def __init__(self, modalities: int):
         box = spaces.Box(-np.inf, np.inf, (FEATURES_DIM,), np.float32)
@@ -157,7 +159,7 @@ class Features(gym.Env[Any, Any]):
 
 
 def heads_alone(modalities: int, batch_size: int, device: str, compile: bool = False) -> Step:
-    """A step of HAVESAC on features: heads, losses, and their part of optimizer and target update."""
+    """Create a step of HAVESAC on features: heads, losses, and their share of optimizer and target update."""
     env = DummyVecEnv([lambda: Features(modalities)])
     keys = [f"z_{i}" for i in range(modalities)]
     model = have_sac(env, "float32", device, encoder_classes=dict.fromkeys(keys, NormOnly), compile=compile)
@@ -172,14 +174,14 @@ def heads_alone(modalities: int, batch_size: int, device: str, compile: bool = F
 
 
 class NoEncoder(nn.Module):
-    """Stands for an encoder where only what comes before it is timed."""
+    """Replacement for an encoder when only the parts before it are timed."""
 
     def forward(self, inputs: th.Tensor) -> th.Tensor:
         return inputs.new_zeros(len(inputs), FEATURES_DIM)
 
 
 def parts(model: HAVESAC, batch_size: int) -> dict[str, Step]:
-    """The parts of a step that feed and run the encoders, each on its own."""
+    """Create the parts of a step up to the encoders."""
     buffer = model.replay_buffer
     assert buffer is not None
     batch = buffer.sample(batch_size)
@@ -192,7 +194,7 @@ def parts(model: HAVESAC, batch_size: int) -> dict[str, Step]:
 
 
 def decoding(encoder: MultiModalEncoder, batch: DictReplayBufferSamples) -> Step:
-    """What the encoder does to raw observations before the encoders of the modalities see them."""
+    """Create the step that decodes raw observations for the encoders of the modalities."""
     decoder = copy.deepcopy(encoder)
     decoder.encoders = nn.ModuleList(NoEncoder() for _ in encoder.encoders)
 
@@ -205,7 +207,7 @@ def decoding(encoder: MultiModalEncoder, batch: DictReplayBufferSamples) -> Step
 
 
 def encoders_alone(model: HAVESAC, batch: DictReplayBufferSamples) -> Step:
-    """The encoders of the modalities on decoded inputs, trained on observations and applied to next_observations."""
+    """Create the step that trains the encoders on decoded observations and applies them to next_observations."""
     encode = on_decoded(model.critic.encoder, batch.observations)
     encode_next = on_decoded(model.critic_target.encoder, batch.next_observations)
     gradient = th.ones_like(encode())
@@ -221,10 +223,11 @@ def encoders_alone(model: HAVESAC, batch: DictReplayBufferSamples) -> Step:
 
 def on_decoded(encoder: MultiModalEncoder, observations: dict[str, th.Tensor]) -> Callable[[], th.Tensor]:
     """
-    The features (B, d, F) from inputs decoded beforehand, as the encoder itself decodes them.
+    Create a function that computes the features (B, d, F) from inputs that are already decoded.
 
-    :param encoder: whose modalities' encoders are called, under the autocast that it calls them with
-    :param observations: raw
+    :param encoder: Encoder whose modalities' encoders are called, with the same autocast
+    :param observations: Raw observations
+    :return: The function
     """
     calls: list[tuple[nn.Module, th.Tensor, bool, th.dtype]] = []
 
@@ -235,7 +238,7 @@ def on_decoded(encoder: MultiModalEncoder, observations: dict[str, th.Tensor]) -
 
     hooks = [module.register_forward_pre_hook(remember) for module in encoder.encoders]
     with th.no_grad():
-        encoder.forward(observations)  # not as compiled, which need not call the hooks
+        encoder.forward(observations)  # a compiled forward may not call the hooks
     for hook in hooks:
         hook.remove()
 
@@ -250,7 +253,7 @@ def on_decoded(encoder: MultiModalEncoder, observations: dict[str, th.Tensor]) -
 
 
 def kernel_ms(step: Step, repeats: int = 10) -> float:
-    """Milliseconds that a GPU spends in kernels for one step (copies between host and GPU left out)."""
+    """Measure the milliseconds that a GPU spends in kernels for one step, without copies between host and GPU."""
     with th.profiler.profile(activities=[th.profiler.ProfilerActivity.CUDA]) as profiler:
         for _ in range(repeats):
             step()
@@ -275,15 +278,16 @@ def measure(
     **kwargs: Any,
 ) -> list[Row]:
     """
-    One row for every contender and part.
+    Measure all contenders.
 
-    :param shape: of the images and the batch
-    :param modalities: d
-    :param precisions: of HAVESAC's encoders
-    :param rounds: timed steps of each contender; on a GPU each is the mean of ten steps
-    :param with_sb3: whether SB3's SAC takes part
+    :param shape: Shape of the images and the batch
+    :param modalities: Number of modalities
+    :param precisions: Precisions of HAVESAC's encoders
+    :param rounds: Number of timed steps of each contender; on a GPU each is the mean of ten steps
+    :param with_sb3: Whether to measure SB3's SAC
     :param device: "cpu" or "cuda"
-    :param kwargs: of HAVESAC
+    :param kwargs: Arguments of HAVESAC
+    :return: One row per contender and part
     """
     env = make_env(dict(list(CHANNELS.items())[:modalities]), shape.image_size)
     have = {
@@ -331,7 +335,7 @@ def measure(
 
 
 def summary(measured: Mapping[Contender, Times], precisions: Sequence[str]) -> list[Row]:
-    """Rows of all contenders and, by subtraction within a round, of what HAVESAC's step takes beside its parts."""
+    """Create the rows of all contenders, and of the rest of HAVESAC's step by subtraction within a round."""
     times = dict(measured)
     for precision in precisions:
         step, *known = (times[name, precision] for name in ("HAVESAC", *PARTS))
@@ -363,9 +367,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--skip-sb3", action="store_true")
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=1)
-    parser.add_argument("--retain-memory", action="store_true", help="malloc keeps freed memory, for all contenders")
-    parser.add_argument("--storage", help="of HAVESAC's replay buffer: memory, mmap or device")
-    parser.add_argument("--compile", action="store_true", help="HAVESAC(compile=True)")
+    parser.add_argument("--retain-memory", action="store_true", help="let malloc keep freed memory, for all contenders")
+    parser.add_argument("--storage", help="storage of HAVESAC's replay buffer: memory, mmap or device")
+    parser.add_argument("--compile", action="store_true", help="use HAVESAC(compile=True)")
     parser.add_argument("--output", type=Path, default=RESULTS / "update_speed.csv")
     args = parser.parse_args(arguments)
     th.set_num_threads(args.threads)

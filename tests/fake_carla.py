@@ -1,313 +1,409 @@
-"""A CARLA server in memory, for driving the real client code without one.
+"""The classes of the ``carla`` module that need a server, as a fake that runs in memory.
 
-``install(monkeypatch, server)`` puts it in the place of ``carla.Client``; everything else is reached through the
-client. Transforms, controls, settings, weathers, waypoints and the map are the real objects of the ``carla`` module,
-which work without a server. The fake is stricter than the real client where that lets mistakes pass.
+Every class and method has the name and the arguments of the real one (test_fake_carla.py). Value types such as
+transforms, controls, settings, weathers and maps are the real ones, because they work without a server. What happens
+on the server is in fake_carla_server.py.
 """
 
 from __future__ import annotations
 
-import threading
-import time
-import traceback
-from collections import Counter
-from typing import Any
+import copy
+import fnmatch
+import functools
+import math
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, ClassVar, Concatenate, ParamSpec, TypeVar
 
 import carla
-import numpy as np
-import pytest
-from fake_carla_actors import Actor, Sensor, Vehicle
-from fake_carla_client import SETTINGS, Client, TrafficManager
-from fake_carla_data import ActorBlueprint, SensorData, blueprints
-from fake_carla_road import other_town, town04
+
+if TYPE_CHECKING:
+    from fake_carla_server import Server
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+SETTINGS = ("synchronous_mode", "fixed_delta_seconds", "no_rendering_mode", "max_culling_distance")
+MAX_STEER = 70.0  # [degrees]
 
 
-class Server:
-    """What a CARLA server holds, and the switches that make it fail.
+def remote(method: Callable[Concatenate[Any, P], R]) -> Callable[Concatenate[Any, P], R]:
+    """A call that waits for the answer of the server, and fails without one."""
 
-    :param town: the map that it has loaded
-    :param port: where clients find it
-    """
+    @functools.wraps(method)
+    def call(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> R:
+        self._server.reach(method.__qualname__, self)
+        result = method(self, *args, **kwargs)
+        self._server.finish(method.__qualname__)
+        return result
 
-    def __init__(self, town: str = "Town04", port: int = 2000) -> None:
-        self.port, self.version = port, "0.9.16"
-        self.alive, self.life, self.episode = True, 0, 0
-        self.calls: list[str] = []  # every call, "World.tick"
-        self.missed = 0  # calls that waited in vain
-        self.violations: list[str] = []  # what the real client allows, though it does harm
-        self.timeouts: dict[str, float] = {}  # the last of "calls" and of "ticks" [s]
-        self.sent: dict[str, dict[int, Any]] = {}  # type of sensor -> frame -> data
-        self.settings = carla.WorldSettings()
-        self.frame, self.elapsed, self._last_id = 1000, 37.25, 23
-        self.traffic_managers: dict[int, TrafficManager] = {}
-        self.library = blueprints()
-        self.threaded = False  # callbacks run in threads of their own
-        self._failures: dict[tuple[str, int, bool], BaseException | None] = {}
-        self._count: Counter[str] = Counter()
-        self._drop: Counter[str] = Counter()
-        self._late: dict[str, int] = {}
-        self._slow: dict[str, float] = {}
-        self._shift: dict[str, int] = {}
-        self._corrupt: set[str] = set()
-        self._blocked = 0
-        self._impulses: list[tuple[float, float, float]] = []
-        self._waiting: list[tuple[int, Sensor, SensorData]] = []
-        self._threads: dict[int, threading.Thread] = {}  # the last of each sensor
-        self.load(town)
+    return call
 
-    # ---- switches ----
 
-    def fail(self, call: str, error: BaseException, after: int = 0, done: bool = False) -> None:
-        """The call after the next ``after`` ones raises ``error``; "World.tick", "Sensor.stop" and so on, "*" for any.
+def posted(method: Callable[Concatenate[Any, P], None]) -> Callable[Concatenate[Any, P], None]:
+    """A call that does not wait, and has no effect without a server."""
 
-        :param done: the server has done its work when the error strikes
-        """
-        self._failures[call, self._count[call] + after + 1, done] = error
+    @functools.wraps(method)
+    def call(self: Any, /, *args: P.args, **kwargs: P.kwargs) -> None:
+        if self._server.begin(method.__qualname__, self):
+            method(self, *args, **kwargs)
+        self._server.finish(method.__qualname__)
 
-    def die(self, call: str | None = None, after: int = 0) -> None:
-        """Stop answering, at once or from the call after the next ``after`` ones on."""
-        if call is None:
-            self.alive = False
+    return call
+
+
+def expect(value: Any, *kinds: type) -> None:
+    """Raise what Boost.Python raises: NumPy's numbers are neither float nor int."""
+    kinds = (*kinds, int) if float in kinds else kinds
+    if not isinstance(value, kinds):
+        raise TypeError(f"Python argument types did not match C++ signature: {type(value).__name__} for {kinds}")
+
+
+# ---- data of the sensors ----
+
+
+class SensorData:
+    """Its buffer is overwritten when the callback has returned, as CARLA reuses it."""
+
+    _buffer = bytearray()
+
+    def __init__(self, frame: int) -> None:
+        self.frame = frame
+
+
+class Image(SensorData):
+    def __init__(self, frame: int, size: int, data: bytes) -> None:
+        super().__init__(frame)
+        self._buffer = bytearray(data)
+        self.raw_data, self.width, self.height = memoryview(self._buffer), size, size
+
+
+class DVSEventArray(SensorData):
+    def __init__(self, frame: int, data: bytes) -> None:
+        super().__init__(frame)
+        self._buffer = bytearray(data)
+        self.raw_data = memoryview(self._buffer)
+
+
+class CollisionEvent(SensorData):
+    def __init__(self, frame: int, normal_impulse: carla.Vector3D) -> None:
+        super().__init__(frame)
+        self.normal_impulse = normal_impulse
+
+
+# ---- blueprints ----
+
+
+class ActorAttribute:
+    def __init__(self, value: str, kind: type = str) -> None:
+        self._value, self._kind = value, kind
+
+    @property
+    def recommended_values(self) -> list[str]:
+        return [self._value]
+
+    def as_str(self) -> str:
+        return self._value
+
+
+class ActorBlueprint:
+    def __init__(self, name: str, attributes: dict[str, ActorAttribute]) -> None:
+        self._name, self._attributes = name, dict(attributes)
+
+    @property
+    def id(self) -> str:
+        return self._name
+
+    def has_attribute(self, id: str) -> bool:
+        return id in self._attributes
+
+    def get_attribute(self, id: str) -> ActorAttribute:
+        if id not in self._attributes:
+            raise IndexError(f"attribute '{id}' not found")
+        return self._attributes[id]
+
+    def set_attribute(self, id: str, value: str) -> None:
+        expect(value, str)
+        attribute = self.get_attribute(id)
+        if attribute._kind is bool and value not in ("true", "false"):
+            raise ValueError("invalid attribute value")
+        attribute._kind(value)
+        self._attributes[id] = ActorAttribute(value, attribute._kind)
+
+
+class BlueprintLibrary:
+    def __init__(self, blueprints: list[ActorBlueprint]) -> None:
+        self._blueprints = blueprints
+
+    def find(self, id: str) -> ActorBlueprint:
+        for blueprint in self:
+            if blueprint.id == id:
+                return blueprint
+        raise IndexError(f"blueprint '{id}' not found")
+
+    def filter(self, wildcard_pattern: str) -> BlueprintLibrary:
+        return BlueprintLibrary([b for b in self._blueprints if fnmatch.fnmatch(b.id, wildcard_pattern)])
+
+    def __iter__(self) -> Iterator[ActorBlueprint]:
+        return (ActorBlueprint(blueprint.id, blueprint._attributes) for blueprint in self._blueprints)
+
+
+# ---- actors ----
+
+
+class Actor:
+    def __init__(self, server: Server, number: int, blueprint: ActorBlueprint, pose: carla.Transform) -> None:
+        self._server, self._life = server, server.life
+        self._number, self._blueprint = number, blueprint
+        self._x, self._y, self._z = pose.location.x, pose.location.y, pose.location.z
+        self._yaw, self._speed = math.radians(pose.rotation.yaw), 0.0
+        # State at the last tick, which is all that a client sees
+        self._seen = (carla.Transform(), carla.Vector3D())
+
+    @property
+    def id(self) -> int:
+        return self._number
+
+    @property
+    def type_id(self) -> str:
+        return self._blueprint.id
+
+    @property
+    def attributes(self) -> dict[str, str]:
+        return {name: attribute.as_str() for name, attribute in self._blueprint._attributes.items()}
+
+    def get_transform(self) -> carla.Transform:
+        return self._seen[0]
+
+    def get_location(self) -> carla.Location:
+        return self._seen[0].location
+
+    def get_velocity(self) -> carla.Vector3D:
+        return self._seen[1]
+
+    def _pose(self) -> carla.Transform:
+        location = carla.Location(self._x, self._y, self._z)
+        return carla.Transform(location, carla.Rotation(yaw=math.degrees(self._yaw)))
+
+
+class Vehicle(Actor):
+    """Drives on a plane: gains 6 m/s^2 at full throttle, and loses 10 with the brake and 20 with the hand brake."""
+
+    def __init__(self, server: Server, number: int, blueprint: ActorBlueprint, pose: carla.Transform) -> None:
+        super().__init__(server, number, blueprint, pose)
+        self._control = carla.VehicleControl()
+        self._autopilot: int | None = None
+
+    @posted
+    def apply_control(self, control: carla.VehicleControl) -> None:
+        expect(control, carla.VehicleControl)
+        assert 0 <= control.throttle <= 1 and 0 <= control.brake <= 1 and -1 <= control.steer <= 1, control
+        self._control = control
+
+    @remote
+    def get_physics_control(self) -> Any:
+        physics: Any = carla.VehiclePhysicsControl()
+        physics.wheels = [carla.WheelPhysicsControl(max_steer_angle=MAX_STEER) for _ in range(4)]
+        return physics
+
+    @posted
+    def set_target_velocity(self, velocity: carla.Vector3D) -> None:
+        expect(velocity, carla.Vector3D)
+        self._speed = velocity.x * math.cos(self._yaw) + velocity.y * math.sin(self._yaw)
+
+    @posted
+    def set_autopilot(self, enabled: bool = True, tm_port: int = 8000, /) -> None:
+        expect(tm_port, int)
+        assert tm_port in self._server.traffic_managers, "the client would start a second traffic manager"
+        self._autopilot = tm_port if enabled else None
+
+    def _move(self, dt: float) -> None:
+        control = self._control
+        if self._autopilot is not None:
+            self._speed = self._server.traffic_managers[self._autopilot]._speeds.get(self.id, 60.0) / 3.6
         else:
-            self._failures[call, self._count[call] + after + 1, False] = None
+            drag = min(abs(self._speed) / dt, 10.0 * control.brake + 20.0 * control.hand_brake)
+            self._speed += (6.0 * control.throttle - math.copysign(drag, self._speed)) * dt
+            self._yaw += self._speed / 2.9 * math.tan(math.radians(MAX_STEER) * control.steer) * dt
+        self._x += self._speed * math.cos(self._yaw) * dt
+        self._y += self._speed * math.sin(self._yaw) * dt
+        road = self._server.map.get_waypoint(carla.Location(self._x, self._y, self._z)).transform
+        self._z = road.location.z
+        forward = carla.Vector3D(self._speed * math.cos(self._yaw), self._speed * math.sin(self._yaw), 0.0)
+        self._seen = (self._pose(), forward)
 
-    def restart(self, town: str = "Town04") -> None:
-        """A fresh server at the same port; no handle of before is good for anything."""
-        self.alive, self.life, self.missed = True, self.life + 1, 0
-        self.settings, self.frame, self.elapsed = carla.WorldSettings(), 3, 0.5
-        self.load(town)
 
-    def drop(self, sensor: str, ticks: int) -> None:
-        """The sensor misses its next ticks."""
-        self._drop[sensor] += ticks
+class Sensor(Actor):
+    _parent: Vehicle
+    _callback: Callable[[Any], Any] | None = None
+    _ticks = 0
 
-    def late(self, sensor: str, ticks: int) -> None:
-        """All that the sensor sends comes so many ticks later."""
-        self._late[sensor] = ticks
+    @posted
+    def listen(self, callback: Callable[[Any], Any]) -> None:
+        self._callback = callback
 
-    def slow(self, sensor: str, seconds: float) -> None:
-        """All that the sensor sends comes so much after the tick has returned, from another thread."""
-        self._slow[sensor] = seconds
+    @posted
+    def stop(self) -> None:
+        self._callback = None
 
-    def misnumber(self, sensor: str, by: int) -> None:
-        """Measurements carry a wrong frame."""
-        self._shift[sensor] = by
 
-    def corrupt(self, sensor: str) -> None:
-        """Half of each buffer is missing, so that whoever decodes it in the callback fails there."""
-        self._corrupt.add(sensor)
+# ---- the client ----
 
-    def block(self, spawns: int) -> None:
-        """So many attempts to spawn a vehicle end in a collision."""
-        self._blocked = spawns
 
-    def collide(self, *impulses: tuple[float, float, float]) -> None:
-        """Impulses [N s] that the next ticks' collision sensor reports, one a tick."""
-        self._impulses.extend(impulses)
+class Client:
+    _find: ClassVar[Callable[[str, int], Server]]  # set by fake_carla_server.install
 
-    def heal(self) -> None:
-        """No more failures."""
-        self._failures.clear()
-        for switch in (self._drop, self._late, self._slow, self._shift):
-            switch.clear()
-        self._corrupt.clear()
-        self._impulses.clear()
-        self._blocked, self.threaded = 0, False
+    def __init__(self, host: str = "127.0.0.1", port: int = 2000) -> None:
+        expect(port, int)
+        self._server = type(self)._find(host, port)
+        self._life = self._server.life
 
-    # ---- what tests look at ----
+    def set_timeout(self, seconds: float, /) -> None:
+        expect(seconds, float)
+        self._server.timeouts["calls"] = seconds
 
-    @property
-    def ego(self) -> Vehicle:
-        """The only vehicle that no traffic manager drives."""
-        (ego,) = (vehicle for vehicle in self.vehicles() if vehicle._autopilot is None)
-        return ego
+    @remote
+    def get_client_version(self) -> str:
+        return "0.9.16"
 
-    def vehicles(self) -> list[Vehicle]:
-        return [actor for actor in self.actors.values() if isinstance(actor, Vehicle)]
+    @remote
+    def get_server_version(self) -> str:
+        return self._server.version
 
-    def sensors(self) -> list[Sensor]:
-        return [actor for actor in self.actors.values() if isinstance(actor, Sensor)]
+    @remote
+    def get_available_maps(self) -> list[str]:
+        return ["/Game/Carla/Maps/Town01", "/Game/Carla/Maps/Town04"]
 
-    def left_behind(self) -> list[str]:
-        """What a client should have cleared away before it left."""
-        found = [f"{actor.type_id} {number} lives" for number, actor in self.actors.items()]
-        found += [f"{name} is {value}" for name in SETTINGS[:3] if (value := getattr(self.settings, name))]
-        managers = self.traffic_managers.items()
-        found += [f"traffic manager at {port} runs" for port, tm in managers if tm._runs()]
-        return found + self.violations
+    @remote
+    def get_world(self) -> World:
+        return World(self._server)
 
-    def join(self) -> None:
-        """Wait for the callbacks that are still on their way."""
-        for thread in self._threads.values():
-            thread.join()
-        self._threads.clear()
+    @remote
+    def load_world(self, map_name: str) -> World:
+        self._server.load(map_name)
+        self._server.settings = carla.WorldSettings()
+        return World(self._server)
 
-    # ---- the simulation ----
+    @remote
+    def get_trafficmanager(self, port: int = 8000, /) -> TrafficManager:
+        expect(port, int)
+        managers = self._server.traffic_managers
+        if port not in managers or not managers[port]._usable:
+            managers[port] = TrafficManager(self._server)
+        return managers[port]
 
-    def load(self, town: str) -> None:
-        texts = {"Town04": town04, "Town01": other_town}
-        if town not in texts:
-            raise RuntimeError(f"map '{town}' not found")
-        self.episode += 1
-        self.map = carla.Map(f"Carla/Maps/{town}", texts[town]())
-        self.actors: dict[int, Actor] = {}
-        self.listed: list[int] = []  # of the last tick
-        self.weather = carla.WeatherParameters()
-        self._waiting.clear()
+    @remote
+    def apply_batch_sync(self, commands: list[Any], do_tick: bool = False) -> list[Any]:
+        assert all(isinstance(command, carla.command.DestroyActor) for command in commands) and not do_tick
+        errors = [self._server.remove(command.actor_id) for command in commands]
+        return [SimpleNamespace(error=error, has_error=lambda error=error: bool(error)) for error in errors]
 
-    def note(self, call: str, handle: Any) -> bool:
-        """Record a call; raise what was arranged for it; tell whether the handle belongs to this server's world."""
-        self.calls.append(call)
-        self._count.update((call, "*"))
-        self._strike(call, done=False)
-        return self.alive and handle._life == self.life
 
-    def answered(self, call: str) -> None:
-        """The end of a call that waits for its answer."""
-        self._strike(call, done=True)
+class World:
+    def __init__(self, server: Server) -> None:
+        self._server, self._life = server, server.life
 
-    def _strike(self, call: str, done: bool) -> None:
-        for name in (call, "*"):
-            if (key := (name, self._count[name], done)) in self._failures:
-                error = self._failures.pop(key)
-                if error is not None:
-                    raise error
-                self.alive = False
+    @remote
+    def get_map(self) -> carla.Map:
+        return self._server.map
 
-    def reach(self, call: str, handle: Any) -> None:
-        if not self.note(call, handle):
-            self.missed += 1
-            raise RuntimeError(
-                "time-out of 200ms while waiting for the simulator, make sure the simulator is ready and connected to "
-                f"localhost:{self.port}"
-            )
-        if getattr(handle, "_episode", self.episode) != self.episode:
-            raise RuntimeError(
-                "trying to access an expired episode; a new episode was started in the simulation but an object tried "
-                "accessing the old one."
-            )
+    @remote
+    def get_settings(self) -> carla.WorldSettings:
+        settings = carla.WorldSettings()
+        for name in SETTINGS:
+            setattr(settings, name, getattr(self._server.settings, name))
+        return settings
 
-    @property
-    def step_length(self) -> float:
-        return float(self.settings.fixed_delta_seconds or 0.0)
+    @remote
+    def apply_settings(self, settings: carla.WorldSettings, /) -> int:
+        expect(settings, carla.WorldSettings)
+        run_traffic_managers()
+        self._server.settings = settings
+        return self._server.frame
 
-    def tick(self) -> int:
-        self._deliver_late()
-        self.frame += 1
-        self.elapsed += self.step_length
-        for actor in self.actors.values():
-            actor._move(self.step_length)
-        for actor in self.actors.values():
-            actor._report()
-        self.listed = list(self.actors)
-        for sensor in self.sensors():
-            for data in sensor._measure():
-                self._send(sensor, data)
-        return self.frame
+    @remote
+    def get_weather(self) -> Any:
+        return self._server.weather
 
-    def scene(self) -> bytes:
-        """Everything that the cameras see, where the vehicles are and what the weather is."""
-        poses = np.array([(v._x, v._y, v._yaw) for v in self.vehicles()]).round(6)
-        return poses.tobytes() + str(self.weather).encode()
+    @posted
+    def set_weather(self, weather: carla.WeatherParameters) -> None:
+        expect(weather, carla.WeatherParameters)
+        self._server.weather = weather
 
-    def due_impulses(self) -> list[tuple[float, float, float]]:
-        return [self._impulses.pop(0)] if self._impulses else []
+    @remote
+    def get_blueprint_library(self) -> BlueprintLibrary:
+        return self._server.library
 
-    def touched_by(self, vehicle: Vehicle) -> list[Vehicle]:
-        return [other for other in self.vehicles() if other is not vehicle and vehicle._touches(other)]
+    @remote
+    def get_actors(self) -> list[Actor]:
+        actors = self._server.actors
+        return [copy.copy(actors[number]) for number in self._server.listed if number in actors]
 
-    def spawn(self, blueprint: ActorBlueprint, transform: carla.Transform, parent: Actor | None) -> Actor | None:
-        kind = Sensor if blueprint.id.startswith("sensor.") else Vehicle
-        self._last_id += 1
-        actor = kind(self, self._last_id, blueprint, transform, parent)
-        if isinstance(actor, Vehicle):
-            ground = self.map.get_waypoint(transform.location).transform.location.z
-            self._blocked -= (blocked := self._blocked > 0)
-            if blocked or actor._z < ground + 0.05 or self.touched_by(actor):
-                return None
-        self.actors[actor.id] = actor
+    def get_snapshot(self) -> Any:
+        server = self._server
+        return SimpleNamespace(timestamp=carla.Timestamp(server.frame, server.elapsed, server.dt, 0.0))
+
+    def try_spawn_actor(
+        self, blueprint: ActorBlueprint, transform: carla.Transform, attach_to: Actor | None = None
+    ) -> Actor | None:
+        expect(transform, carla.Transform)
+        try:
+            self._server.reach("World.try_spawn_actor", self)
+        except RuntimeError as error:
+            if "time-out" in str(error):
+                return None  # the real client also hides a lost connection
+            raise
+        actor = self._server.spawn(blueprint, transform, attach_to)
+        self._server.finish("World.try_spawn_actor")
         return actor
 
-    def remove(self, number: int) -> bool:
-        actor = self.actors.pop(number, None)
-        if actor is None:
-            return False
-        if isinstance(actor, Sensor) and actor.is_listening():
-            self.violations.append(f"{actor.type_id} was destroyed while it was listening")
-        self.violations += [
-            f"{actor.type_id} was destroyed before its {child.type_id}"
-            for child in self.actors.values()
-            if child.parent is actor
-        ]
-        actor._destroyed = True
-        return True
-
-    # ---- delivery ----
-
-    def _send(self, sensor: Sensor, data: SensorData) -> None:
-        name = sensor.type_id
-        if self._drop[name] > 0:
-            self._drop[name] -= 1
-            return
-        data._fields["frame"] += self._shift.get(name, 0)
-        if name in self._corrupt:
-            data._fields["raw_data"] = data._fields["raw_data"][: len(data._buffer) // 2 - 1]
-        if self._late.get(name):
-            self._waiting.append((self.frame + self._late[name], sensor, data))
-        else:
-            self._hand_over(sensor, data, self._slow.get(name, 0.0))
-
-    def _deliver_late(self) -> None:
-        due = [entry for entry in self._waiting if entry[0] <= self.frame + 1]
-        self._waiting = [entry for entry in self._waiting if entry not in due]
-        for _, sensor, data in due:
-            self._hand_over(sensor, data, 0.0)
-
-    def _hand_over(self, sensor: Sensor, data: SensorData, delay: float) -> None:
-        callback = sensor._callback
-        if callback is None:
-            return
-
-        before, due = self._threads.get(sensor.id), time.monotonic() + delay
-
-        def run() -> None:
-            if before is not None:
-                before.join()  # a sensor's data come in order
-            time.sleep(max(0.0, due - time.monotonic()))
-            try:
-                callback(data)
-            except Exception:  # the client prints it and goes on
-                traceback.print_exc()
-            data._die()
-
-        if self.threaded or delay:
-            self._threads[sensor.id] = threading.Thread(target=run, daemon=True)
-            self._threads[sensor.id].start()
-        else:
-            run()
+    @remote
+    def tick(self, seconds: float = 10.0) -> int:
+        expect(seconds, float)
+        self._server.timeouts["ticks"] = seconds
+        run_traffic_managers()
+        return self._server.tick()
 
 
-def install(monkeypatch: pytest.MonkeyPatch, *servers: Server) -> None:
-    """Let ``carla.Client`` find these servers, and nothing else."""
-
-    def find(host: str, port: int) -> Server:
-        for server in servers:
-            if server.port == port and host in ("localhost", "127.0.0.1"):
-                return server
-        nobody = Server(port=port)
-        nobody.die()
-        return nobody
-
-    monkeypatch.setattr(Client, "_find", staticmethod(find), raising=False)
-    monkeypatch.setattr(carla, "Client", Client)
-    new_process(monkeypatch, *servers)
+def run_traffic_managers() -> None:
+    """What every tick of any world, and every change of settings, does with all traffic managers of the process."""
+    for manager in TrafficManager._of_this_process:
+        if manager._usable and manager._synchronous and not manager._runs():
+            manager._server.violations.append("a traffic manager ran without its server: the process would abort")
 
 
-def new_process(monkeypatch: pytest.MonkeyPatch, *servers: Server) -> None:
-    """Traffic managers and callbacks have died with the clients' process."""
-    for server in servers:
-        server.traffic_managers.clear()
-        server.listed.clear()  # a client knows of no actor before the first tick that it sees
-        for sensor in server.sensors():
-            sensor._callback = None
-    monkeypatch.setattr(TrafficManager, "_of_this_process", [], raising=False)
+class TrafficManager:
+    """Lives in the client's process, and aborts it when its server is gone."""
+
+    _of_this_process: ClassVar[list[TrafficManager]] = []
+
+    def __init__(self, server: Server) -> None:
+        self._server, self._life = server, server.life
+        self._synchronous, self._usable = False, True
+        self._seed: int | None = None
+        self._speeds: dict[int, float] = {}
+        self._of_this_process.append(self)
+
+    def _runs(self) -> bool:
+        return self._usable and self._server.alive and self._life == self._server.life
+
+    @remote
+    def set_synchronous_mode(self, mode_switch: bool) -> None:
+        self._synchronous = mode_switch
+
+    @remote
+    def set_random_device_seed(self, value: int) -> None:
+        expect(value, int)
+        self._seed = value
+
+    @remote
+    def set_desired_speed(self, actor: Actor, speed: float) -> None:
+        expect(actor, Actor)
+        expect(speed, float)
+        self._speeds[actor.id] = speed
+
+    @remote
+    def shut_down(self) -> None:
+        if self._synchronous:
+            self._server.violations.append("a traffic manager was shut down in synchronous mode")
+        self._usable = False

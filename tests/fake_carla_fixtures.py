@@ -1,46 +1,76 @@
-"""Fixtures of the tests that drive CarlaVision-v0 on the fake server."""
+"""Options, helpers and fixtures of the tests that run CarlaVision-v0 on the fake server."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import carla
 import numpy as np
 import pytest
-from fake_carla import Server, install, new_process
+from fake_carla import Client, TrafficManager
+from fake_carla_server import Server
 
 from sb3_have.envs.carla_vision import CarlaVisionEnv, session
 
-SMALL: dict[str, Any] = {"image_size": 16, "vehicles_count": 3, "timeout": 0.5}
-#: No traffic, and the cheapest sensor.
+# Small and quick options for the environment: with traffic, and without traffic and with the cheapest sensor
+SMALL: dict[str, Any] = {"image_size": 16, "vehicles_count": 2, "timeout": 0.2}
 ALONE: dict[str, Any] = {**SMALL, "vehicles_count": 0, "modalities": ("depth",)}
-#: Time-outs that a test can wait for.
-BRIEF: dict[str, Any] = {**SMALL, "vehicles_count": 2, "timeout": 0.1, "initial_speed": 10.0}
 FULL = np.array([1.0, 0.0], dtype=np.float32)
+STRAIGHT = np.zeros(2, dtype=np.float32)
 Start = Callable[..., CarlaVisionEnv]
 
 
-def fresh(monkeypatch: pytest.MonkeyPatch) -> Server:
-    """A new server of CARLA at localhost:2000."""
-    found = Server()
-    install(monkeypatch, found)
-    restart_process(monkeypatch, found)
-    return found
+def install(monkeypatch: pytest.MonkeyPatch, *servers: Server) -> None:
+    """Start a process in which ``carla.Client`` finds these servers and nothing else."""
 
+    def find(host: str, port: int) -> Server:
+        for server in servers:
+            if server.port == port and host in ("localhost", "127.0.0.1"):
+                return server
+        nobody = Server(port=port)
+        nobody.alive = False
+        return nobody
 
-def restart_process(monkeypatch: pytest.MonkeyPatch, server: Server) -> None:
-    """Forget what a process remembers of servers that it drives, and of those that it lost."""
-    monkeypatch.setattr(session, "_drivers", {})
+    monkeypatch.setattr(Client, "_find", staticmethod(find), raising=False)
+    monkeypatch.setattr(carla, "Client", Client)
+    # Callbacks, traffic managers and what the module remembers belong to the process
+    monkeypatch.setattr(TrafficManager, "_of_this_process", [])
+    monkeypatch.setattr(session, "_tm_ports", set())
     monkeypatch.setattr(session, "_lost_with_traffic", [])
-    new_process(monkeypatch, server)
+    for server in servers:
+        server.traffic_managers.clear()
+        server.listed.clear()
+        for sensor in server.sensors:
+            sensor._callback = None
+
+
+def fresh(monkeypatch: pytest.MonkeyPatch) -> Server:
+    """Start a new process with a new server at localhost:2000."""
+    server = Server()
+    install(monkeypatch, server)
+    return server
+
+
+def works(server: Server, env: CarlaVisionEnv) -> None:
+    """Check that an episode works, and that nothing is left behind after it."""
+    server.heal()
+    observation, info = env.reset(seed=1)
+    assert env.observation_space.contains(observation) and info["distance"] == 0
+    assert env.step(FULL)[4]["distance"] > 0
+    env.close()
+    assert server.left_behind() == []
 
 
 @pytest.fixture
-def server(monkeypatch: pytest.MonkeyPatch) -> Server:
-    return fresh(monkeypatch)
+def server(monkeypatch: pytest.MonkeyPatch) -> Iterator[Server]:
+    """A server that is checked after the test."""
+    server = fresh(monkeypatch)
+    yield server
+    assert server.left_behind() == []
 
 
 @pytest.fixture
 def start(server: Server) -> Iterator[Start]:
-    """Closes the last environment, then makes and resets a new one. After each test the server must be as it was."""
+    """Make and reset an environment, after closing the last one."""
     opened: list[CarlaVisionEnv] = []
 
     def make(seed: int = 0, **options: Any) -> CarlaVisionEnv:
@@ -56,21 +86,3 @@ def start(server: Server) -> Iterator[Start]:
 
     yield make
     close()
-
-
-@pytest.fixture
-def env(server: Server) -> Iterator[CarlaVisionEnv]:
-    made = CarlaVisionEnv(**BRIEF)
-    yield made
-    made.close()
-    assert server.left_behind() == []
-
-
-def works(server: Server, env: CarlaVisionEnv) -> None:
-    """A new episode runs to its end, and nothing is left after it."""
-    server.heal()
-    observation, info = env.reset(seed=1)
-    assert env.observation_space.contains(observation) and info["distance"] == 0
-    assert env.step(FULL)[4]["distance"] > 0
-    env.close()
-    assert server.left_behind() == []

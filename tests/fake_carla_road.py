@@ -1,48 +1,58 @@
-"""The road that the fake CARLA server lays out: OpenDRIVE text for the real ``carla.Map``."""
+"""OpenDRIVE texts for the real ``carla.Map``."""
 
 import math
 
-#: Where road 45 begins in OpenDRIVE's axes, y to the left, and the height of all roads [m]. Aligned with no axis.
+# Start of road 45 in OpenDRIVE's axes (y to the left), its heading, and the height of all roads [m]
 START, HEADING, HEIGHT = (50.0, -20.0), 0.5, 8.0
-LENGTH, BEND_LENGTH, CURVATURE = 400.0, 300.0, 0.005
-LANE_WIDTH, LANES, SHOULDER = 3.5, 4, 3.0
-
-_HEADER = (
-    '<?xml version="1.0" standalone="yes"?><OpenDRIVE><header revMajor="1" revMinor="4" name="" version="1" north="0" '
-    'south="0" east="0" west="0"><geoReference><![CDATA[+proj=tmerc +lat_0=0 +lon_0=0]]></geoReference></header>'
-)
+LENGTH, LANES, LANE_WIDTH = 400.0, 4, 3.5
+BEND_CURVATURE = 0.005
 
 
-def town04() -> str:
-    """Road 45, straight, lanes -1 to -4 and a shoulder (-5), and its successor, road 46, a bend to the left."""
-    end = START[0] + LENGTH * math.cos(HEADING), START[1] + LENGTH * math.sin(HEADING)
-    straight = _road(
-        45, LENGTH, START, "<line/>", '<successor elementType="road" elementId="46" contactPoint="start"/>'
+def opendrive(*roads: str) -> str:
+    """A map of roads."""
+    return (
+        '<?xml version="1.0" standalone="yes"?><OpenDRIVE><header revMajor="1" revMinor="4" name="" version="1" '
+        'north="0" south="0" east="0" west="0"><geoReference><![CDATA[+proj=tmerc +lat_0=0 +lon_0=0]]></geoReference>'
+        f"</header>{''.join(roads)}</OpenDRIVE>"
     )
-    arc = f'<arc curvature="{CURVATURE}"/>'
-    bend = _road(46, BEND_LENGTH, end, arc, '<predecessor elementType="road" elementId="45" contactPoint="end"/>')
-    return f"{_HEADER}{straight}{bend}</OpenDRIVE>"
 
 
-def other_town() -> str:
-    """A town with another road only."""
-    return f"{_HEADER}{_road(7, 200.0, (0.0, 0.0), '<line/>', '')}</OpenDRIVE>"
-
-
-def _road(number: int, length: float, start: tuple[float, float], shape: str, link: str) -> str:
+def road(
+    number: int,
+    length: float,
+    start: tuple[float, float] = START,
+    curvature: float = 0.0,
+    left: int = 0,
+    link: str = "",
+) -> str:
+    """A road with four driving lanes and a shoulder on the right, and ``left`` driving lanes on the left."""
+    shape = f'<arc curvature="{curvature}"/>' if curvature else "<line/>"
     geometry = f'<geometry s="0" x="{start[0]}" y="{start[1]}" hdg="{HEADING}" length="{length}">{shape}</geometry>'
-    lanes = "".join(_lane(-k, "driving", LANE_WIDTH) for k in range(1, LANES + 1))
+    right = "".join(_lane(-k, "driving") for k in range(1, LANES + 1)) + _lane(-LANES - 1, "shoulder")
     return (
         f'<road name="" length="{length}" id="{number}" junction="-1"><link>{link}</link>'
         f'<planView>{geometry}</planView><elevationProfile><elevation s="0" a="{HEIGHT}" b="0" c="0" d="0"/>'
-        '</elevationProfile><lanes><laneSection s="0"><center><lane id="0" type="none" level="false"/></center>'
-        f"<right>{lanes}{_lane(-LANES - 1, 'shoulder', SHOULDER)}</right></laneSection></lanes></road>"
+        f'</elevationProfile><lanes><laneSection s="0"><left>{"".join(_lane(k, "driving") for k in range(left, 0, -1))}'
+        f'</left><center><lane id="0" type="none" level="false"/></center><right>{right}</right></laneSection></lanes>'
+        "</road>"
     )
 
 
-def _lane(number: int, kind: str, width: float) -> str:
+def _lane(number: int, kind: str) -> str:
     return (
         f'<lane id="{number}" type="{kind}" level="false"><link><predecessor id="{number}"/>'
-        f'<successor id="{number}"/></link><width sOffset="0" a="{width}" b="0" c="0" d="0"/>'
-        '<roadMark sOffset="0" type="broken" weight="standard" color="white" width="0.15" laneChange="both"/></lane>'
+        f'<successor id="{number}"/></link><width sOffset="0" a="{LANE_WIDTH}" b="0" c="0" d="0"/></lane>'
     )
+
+
+def town04() -> str:
+    """Road 45, which is straight, and its successor, road 46, a bend to the left."""
+    end = START[0] + LENGTH * math.cos(HEADING), START[1] + LENGTH * math.sin(HEADING)
+    after = '<successor elementType="road" elementId="46" contactPoint="start"/>'
+    before = '<predecessor elementType="road" elementId="45" contactPoint="end"/>'
+    return opendrive(road(45, LENGTH, link=after), road(46, 300.0, end, BEND_CURVATURE, link=before))
+
+
+def town01() -> str:
+    """A map with another road only."""
+    return opendrive(road(7, 200.0))

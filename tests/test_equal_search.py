@@ -57,7 +57,7 @@ def test_every_method_has_the_same_trials_and_its_best_has_new_seeds(tmp_path: P
     assert text.count("**") == 4, "one best trial for each of two methods"
     assert f"| gve | 8 | 1.0 [1.0, 1.0] | 1.0 ± 0.0 | {max(rates) * 10:.1f} [" in text
     assert not made, "runs that are there are not repeated"
-    with pytest.raises(FileNotFoundError, match="gve lacks runs of trial 3: make them without --report"):
+    with pytest.raises(FileNotFoundError, match="gve lacks runs of trial 3; run without --report"):
         equal_search.main([*arguments, "--trials", "4", "--report"])
 
 

@@ -1,1 +1,1 @@
-"""Measures and proves training on CUDA in a few minutes, on a machine without a network; ``run.sh`` runs all of it."""
+"""Checks and measurements of training on CUDA, in a few minutes and without a network; ``run.sh`` runs all of them."""

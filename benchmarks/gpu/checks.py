@@ -1,10 +1,10 @@
-"""Does training on this device compute what it computes on a CPU, and does the host never wait for it?
+"""Check that training on a device computes the same as on a CPU, and that the host does not wait for the device.
 
     python -m benchmarks.gpu.checks --output correctness.csv
     python -m benchmarks.gpu.checks --device cpu --image-size 36 --batch-size 8      # tries the script
 
-A row for each check, appended when it is done: name, whether it holds, what was found, seconds. A check that fails
-stops none of the others; the exit code is 1 if any failed. ``--only`` chooses checks by parts of their names.
+The script appends a row after each check, with its name, whether it passed, details and seconds. A failed check does
+not stop the others; the exit code is 1 if any failed. ``--only`` selects checks by parts of their names.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ Check = Callable[["Setting"], Result]
 
 class Setting:
     """
-    What the checks work on.
+    Settings of the checks.
 
-    :param device: to be checked
-    :param image_size: pixels along each side
-    :param batch_size: of an update
+    :param device: Device to check
+    :param image_size: Height and width of the images [px]
+    :param batch_size: Batch size of an update
     """
 
     def __init__(self, device: str, image_size: int, batch_size: int):
@@ -66,7 +66,7 @@ class Setting:
         self.cuda = th.device(device).type == "cuda"
 
     def model(self, device: str | None = None, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any) -> HAVESAC:
-        """A model with a filled replay buffer."""
+        """Create a model with a filled replay buffer."""
         model = self.empty_model(device, policy_kwargs, **kwargs)
         assert model.env is not None and model.replay_buffer is not None
         for transition in transitions(model.env, TRANSITIONS):
@@ -77,7 +77,7 @@ class Setting:
     def empty_model(
         self, device: str | None = None, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any
     ) -> HAVESAC:
-        """A model whose replay buffer is empty."""
+        """Create a model with an empty replay buffer."""
         policy_kwargs = {"net_arch": [256, 256], "precision": "float32", **(policy_kwargs or {})}
         settings = {"buffer_size": 500, "learning_starts": 20, "batch_size": self.batch_size, "seed": 0, **kwargs}
         env = make_env(TWO, self.image_size, episode_length=25)
@@ -94,7 +94,7 @@ class Setting:
 
 @contextmanager
 def same_noise() -> Iterator[None]:
-    """Draw actions with the same noise on every device, although each device has a generator of its own."""
+    """Draw actions with the same noise on every device, although each device has its own generator."""
     generator = th.Generator().manual_seed(0)
 
     def rsample(self: Normal, sample_shape: Any = ()) -> th.Tensor:
@@ -106,7 +106,7 @@ def same_noise() -> Iterator[None]:
 
 
 def update(model: HAVESAC, batch: DictReplayBufferSamples) -> tuple[dict[str, float], dict[str, th.Tensor]]:
-    """Losses and gradients of one update on a batch from elsewhere."""
+    """Compute losses and gradients of one update on a given batch."""
     model.replay_buffer = StaticBatch(batch, model.device)  # type: ignore[assignment]
     with same_noise():
         model.train(1, len(batch.rewards))
@@ -126,8 +126,8 @@ def check_losses(
     policy_kwargs: dict[str, Any] | None = None,
     **kwargs: Any,
 ) -> Result:
-    """Losses and gradients of an update, by the CPU in float32 and by the device."""
-    # plain gradient descent: Adam's first step is the gradient's sign, of rounding errors too
+    """Compare losses and gradients of an update on the CPU in float32 and on the device."""
+    # Use SGD, because Adam's first step is the sign of the gradient, even of rounding errors
     policy_kwargs = {"optimizer_class": th.optim.SGD, **(policy_kwargs or {})}
     reference = setting.model("cpu", policy_kwargs, **kwargs)
     model = setting.empty_model(None, {**policy_kwargs, "precision": precision}, **kwargs)
@@ -151,7 +151,7 @@ def check_losses(
 
 
 def check_adam(setting: Setting) -> Result:
-    """The fused optimizers, on the same gradients."""
+    """Compare the optimizers, which are fused on a GPU, on the same gradients."""
     models = [setting.empty_model(device) for device in ("cpu", setting.device)]
     models[1].policy.load_state_dict(models[0].policy.state_dict())
     generator = th.Generator().manual_seed(0)
@@ -167,7 +167,7 @@ def check_adam(setting: Setting) -> Result:
 
 
 def check_bfloat16(setting: Setting) -> Result:
-    """What "auto" takes, and the features it gives."""
+    """Check which precision "auto" selects, and its features."""
     plain = setting.model()
     auto = setting.empty_model(None, {"precision": "auto"})
     auto.policy.load_state_dict(plain.policy.state_dict())
@@ -182,12 +182,12 @@ def check_bfloat16(setting: Setting) -> Result:
     return ok, f"native {native}, auto takes {dtype}, features differ by {worst:.1e} and are {features.dtype}"
 
 
-# -- What the host waits for
+# -- Synchronisation
 
 
 @contextmanager
 def no_waiting(setting: Setting) -> Iterator[None]:
-    """Where the host waits for the GPU it is an error."""
+    """Raise an error wherever the host waits for the GPU."""
     if not setting.cuda:
         yield
         return
@@ -199,7 +199,7 @@ def no_waiting(setting: Setting) -> Iterator[None]:
 
 
 def check_no_waiting(setting: Setting, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any) -> Result:
-    """``train`` reads nothing back, sampling included, and leaves finite losses."""
+    """Check that sampling and ``train`` do not wait for the GPU, and that the losses are finite."""
     model = setting.model(None, policy_kwargs, **kwargs)
     model.train(3, setting.batch_size)
     setting.synchronize()
@@ -219,14 +219,14 @@ def batches(buffer: Any, batch_size: int, n_batches: int) -> list[DictReplayBuff
 
 def check_replay(setting: Setting, storage: str, n_batches: int = 30) -> Result:
     """
-    Batches are what SB3's buffer holds, though the copies of many are under way at once: the GPU is kept busy, so that
-    memory that was overwritten too early would show.
+    Check that batches equal those of SB3's buffer while many copies are in progress. The GPU is kept busy, so that
+    memory that is overwritten too early would show.
     """
     env = make_env(TWO, setting.image_size, episode_length=7)
     arguments = (200, env.observation_space, env.action_space)
     reference = DictReplayBuffer(*arguments, device="cpu")  # type: ignore[arg-type]
     buffer = ModalityReplayBuffer(*arguments, device=setting.device, n_stack=3, storage=storage)
-    for transition in transitions(env, 250):  # more than fit: some are overwritten
+    for transition in transitions(env, 250):  # more than fit, so that some are overwritten
         reference.add(*transition)
         buffer.add(*transition)
     expected = batches(reference, setting.batch_size, n_batches)
@@ -252,7 +252,7 @@ def check_replay(setting: Setting, storage: str, n_batches: int = 30) -> Result:
 
 
 def check_save_and_load(setting: Setting, source: str, target: str) -> Result:
-    """A model saved on one device, loaded on another: the same actions, and training goes on."""
+    """Check that a model saved on one device and loaded on another has the same actions and continues training."""
     model = setting.model(source)
     model.train(3, setting.batch_size)
     assert model.env is not None
@@ -279,7 +279,7 @@ def check_save_and_load(setting: Setting, source: str, target: str) -> Result:
 
 
 def check_checkpoint(setting: Setting, target: str | None = None) -> Result:
-    """A training that goes on from a checkpoint, on the same device as the one that was not interrupted does."""
+    """Check that training continues from a checkpoint, and on the same device as without an interruption."""
     model = setting.empty_model()
     with tempfile.TemporaryDirectory() as folder, exact_arithmetic():
         model.learn(40)
@@ -307,7 +307,7 @@ def check_checkpoint(setting: Setting, target: str | None = None) -> Result:
 
 
 def check_learn(setting: Setting) -> Result:
-    """``learn`` with its logs, in the arithmetic that is the default."""
+    """Check ``learn`` with logging, in the default precision."""
     model = setting.empty_model(None, {"precision": "auto"}, replay_buffer_kwargs={"storage": "device"})
     model.learn(80, log_interval=1)
     losses = losses_of(model)
@@ -317,7 +317,7 @@ def check_learn(setting: Setting) -> Result:
 
 
 def check_graph(setting: Setting, **kwargs: Any) -> Result:
-    """The recorded update is the eager one."""
+    """Check that the recorded update equals the eager one."""
     tolerance = 2e-2 if setting.cuda else 1e-4
     losses, parameters = difference(setting.device, setting.image_size, setting.batch_size, **kwargs)
     ok = max(losses, parameters) < tolerance
@@ -325,7 +325,7 @@ def check_graph(setting: Setting, **kwargs: Any) -> Result:
 
 
 def check_graph_no_waiting(setting: Setting) -> Result:
-    """Neither sampling nor the graph's launch makes the host wait."""
+    """Check that neither sampling nor launching the graph makes the host wait."""
     step = GraphedUpdate(setting.model(), setting.batch_size)
     for _ in range(step.warm_up + 2):
         step()
@@ -338,7 +338,7 @@ def check_graph_no_waiting(setting: Setting) -> Result:
 
 
 def check_compile(setting: Setting) -> Result:
-    """Compiled modules compute the eager losses and gradients."""
+    """Check that compiled modules compute the same losses and gradients."""
     models = [setting.model(compile=compiled) for compiled in (False, True)]
     assert models[0].replay_buffer is not None
     batch = models[0].replay_buffer.sample(setting.batch_size)
@@ -351,7 +351,7 @@ def check_compile(setting: Setting) -> Result:
 
 
 def checks(setting: Setting) -> dict[str, Check]:
-    """By name, the most important ones first."""
+    """List the checks by name, the most important ones first."""
     paper: dict[str, Any] = {"target": "paper", "refusion": "free", "local_coef": 0.0}
     device = setting.device
     return {
@@ -390,9 +390,13 @@ def checks(setting: Setting) -> dict[str, Check]:
 
 
 def run(names: Sequence[str], setting: Setting, output: Path) -> int:
-    """Run checks by name and append their rows.
+    """
+    Run checks and write their rows.
 
-    :return: how many failed
+    :param names: Names of the checks
+    :param setting: Settings
+    :param output: CSV file
+    :return: Number of failed checks
     """
     output.parent.mkdir(parents=True, exist_ok=True)
     known, failed = checks(setting), 0

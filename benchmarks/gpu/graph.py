@@ -1,14 +1,14 @@
-"""An update of HAVESAC as one CUDA graph, and its speed beside SB3's SAC and the eager update.
+"""Measure an update of HAVESAC as one CUDA graph, compared with SB3's SAC and the eager update.
 
     python -m benchmarks.gpu.graph --output graph.csv                       # at shape (b) of benchmarks.update_speed
     python -m benchmarks.gpu.graph --device cpu --image-size 36 --batch-sizes 8 --rounds 2     # tries the script
 
-Rows, a group for each batch size: ``SB3 SAC``; ``HAVESAC``; ``HAVESAC graph`` (:class:`GraphedUpdate`, sampling
-included) and ``graph alone`` (without), by where the replay buffer keeps its frames. Columns: ``median_ms`` and
+For each batch size there are rows for ``SB3 SAC``, ``HAVESAC``, ``HAVESAC graph`` (:class:`GraphedUpdate` with
+sampling) and ``graph alone`` (without sampling), by the storage of the replay buffer. The columns are ``median_ms`` and
 quartiles of the wall-clock time of an update, in rounds of ten on a GPU; ``vs_sb3``, how many times faster than SB3;
-``host_ms``, until the call of one update returns, and ``host_share``, that over the time until the GPU has finished;
-``kernels`` and ``kernel_ms``, how many an update launches and the time that the GPU spends in them; ``error`` where
-nothing could be recorded.
+``host_ms``, the time until the call of one update returns, and ``host_share``, its share of the time until the GPU has
+finished; ``kernels`` and ``kernel_ms``, the number of kernels of an update and the time that the GPU spends in them;
+and ``error`` if no graph could be recorded.
 """
 
 from __future__ import annotations
@@ -44,17 +44,17 @@ Samples = TypeVar("Samples", bound=tuple[Any, ...])
 
 class StaticBatch:
     """
-    Stands for the replay buffer where ``train`` has to find the same tensors every time.
+    Replay buffer that always returns the same tensors.
 
-    :param samples: whose values are copied
-    :param device: of the copies
+    :param samples: Samples to copy
+    :param device: Device of the copies
     """
 
     def __init__(self, samples: DictReplayBufferSamples, device: th.device | str):
         self.samples = map_tensors(samples, lambda tensor: tensor.to(device, copy=True))
 
     def fill(self, samples: DictReplayBufferSamples) -> None:
-        """Other values for the same tensors."""
+        """Copy new values into the tensors."""
         for static, new in zip(tensors(self.samples), tensors(samples), strict=True):
             static.copy_(new, non_blocking=True)
 
@@ -63,13 +63,13 @@ class StaticBatch:
 
 
 def tensors(samples: tuple[Any, ...]) -> Iterator[th.Tensor]:
-    """All tensors of a batch."""
+    """Iterate over all tensors of a batch."""
     for value in samples:
         yield from value.values() if isinstance(value, dict) else () if value is None else (value,)
 
 
 def map_tensors(samples: Samples, function: Callable[[th.Tensor], th.Tensor]) -> Samples:
-    """The batch with a function applied to each of its tensors."""
+    """Apply a function to each tensor of a batch."""
     values: list[Any] = [
         {key: function(tensor) for key, tensor in value.items()}
         if isinstance(value, dict)
@@ -81,23 +81,23 @@ def map_tensors(samples: Samples, function: Callable[[th.Tensor], th.Tensor]) ->
 
 class GraphedUpdate:
     """
-    ``HAVESAC.train`` for one update, recorded as a CUDA graph; each call is one update of the training.
+    One update of ``HAVESAC.train``, recorded as a CUDA graph. Each call is one update.
 
-    It is ``model.train`` itself that is recorded, on a batch whose tensors stay where they are: a call samples into
-    them and launches the graph. The first calls are eager, since libraries and optimizers set themselves up in them.
-    Updates with and without actor and target (``policy_delay``, ``target_update_interval``) have graphs of their own.
-    The learning rate is a tensor, so that its schedule goes on; all other numbers are what they were when the graph was
-    recorded, above all ``auxiliary_coefs``, ``tau`` and ``gamma``. The parameters must stay at their addresses.
+    The graph records ``model.train`` on a batch whose tensors do not move; a call samples into them and launches the
+    graph. The first calls are eager, because libraries and optimizers initialise themselves. Updates with and without
+    actor and target (``policy_delay``, ``target_update_interval``) have separate graphs. The learning rate is a tensor,
+    so its schedule continues. All other numbers, such as ``auxiliary_coefs``, ``tau`` and ``gamma``, keep their values
+    from the recording. The parameters must stay at their addresses.
 
-    :param model: with Adam and a constant number of samples in a batch; its optimizers are made capturable
-    :param batch_size: of every update
-    :param warm_up: eager updates before a graph is recorded
-    :raises ValueError: with gSDE, since SB3 draws its noise with a check whose result the host waits for
+    :param model: Model with Adam and a constant batch size; its optimizers become capturable
+    :param batch_size: Batch size of every update
+    :param warm_up: Number of eager updates before a graph is recorded
+    :raises ValueError: With gSDE, because SB3 checks its standard deviations on the host
     """
 
     def __init__(self, model: HAVESAC, batch_size: int, warm_up: int = 3):
         if model.use_sde:
-            raise ValueError("use_sde=True: SB3 checks gSDE's standard deviations on the host, which no graph can do.")
+            raise ValueError("use_sde=True is not supported, because SB3 checks its standard deviations on the host")
         self.model, self.batch_size, self.warm_up = model, batch_size, warm_up
         self.batch: StaticBatch | None = None
         self.learning_rate = th.zeros((), device=model.device)
@@ -123,7 +123,7 @@ class GraphedUpdate:
         self.update()
 
     def update(self) -> None:
-        """An update on the batch as it is."""
+        """Update on the current batch."""
         model = self.model
         rate = float(model.lr_schedule(model._current_progress_remaining))
         if rate != self._rate:
@@ -152,7 +152,7 @@ class GraphedUpdate:
         model.logger.record("train/n_updates", model._n_updates, exclude="tensorboard")
 
     def _record(self) -> tuple[th.cuda.CUDAGraph, dict[str, th.Tensor]]:
-        """The graph and the losses that it writes; recording computes nothing."""
+        """Record a graph without running it; return it with its losses."""
         model = self.model
         n_updates = model._n_updates
         graph = th.cuda.CUDAGraph()
@@ -176,29 +176,34 @@ class GraphedUpdate:
 
 def make_capturable(optimizer: th.optim.Optimizer) -> None:
     """
-    Lets Adam keep the number of its steps on the device, as a graph needs it.
+    Let Adam keep its step count on the device, as a graph requires.
 
-    :raises ValueError: for another optimizer
+    :param optimizer: The optimizer
+    :raises ValueError: If the optimizer is not Adam
     """
     if not isinstance(optimizer, th.optim.Adam):
         raise ValueError(f"{type(optimizer).__name__}: expected torch.optim.Adam.")
     for group in optimizer.param_groups:
         group.update(capturable=True, fused=True, foreach=False)
-    optimizer.load_state_dict(optimizer.state_dict())  # moves what it has counted so far
+    optimizer.load_state_dict(optimizer.state_dict())  # moves the step count to the device
 
 
 def losses_of(model: HAVESAC) -> dict[str, float]:
-    """The losses of the last update."""
+    """Get the losses of the last update."""
     names = (name for name in model.logger.name_to_value if name.endswith(("loss", "ent_coef")))
     return {name: float(model.logger.name_to_value[name]) for name in names}
 
 
 def difference(device: str, image_size: int, batch_size: int, updates: int = 10, **kwargs: Any) -> tuple[float, float]:
     """
-    Train two equal models on the same batches and random numbers, one by ``train`` and one by :class:`GraphedUpdate`.
+    Train two equal models on the same batches and random numbers, with ``train`` and with :class:`GraphedUpdate`.
 
-    :param kwargs: of HAVESAC
-    :return: the greatest relative difference of a loss, and of a tensor of parameters
+    :param device: Device of the models
+    :param image_size: Height and width of the images [px]
+    :param batch_size: Batch size of an update
+    :param updates: Number of updates
+    :param kwargs: Arguments of HAVESAC
+    :return: Largest relative difference of a loss, and of a parameter tensor
     """
     env = make_env(TWO, image_size)
     models = [have_sac(env, "float32", device, **kwargs) for _ in range(2)]
@@ -220,7 +225,7 @@ def difference(device: str, image_size: int, batch_size: int, updates: int = 10,
 
 
 def loss_difference(reference: dict[str, float], other: dict[str, float]) -> tuple[float, str]:
-    """The greatest relative difference of two losses of the same name, infinite for NaN, and the name."""
+    """Find the largest relative difference of two losses with the same name (infinite for NaN), and the name."""
     worst = 0.0, ""
     for name, value in reference.items():
         difference = abs(other[name] - value) / (abs(value) + 1e-6)
@@ -229,14 +234,15 @@ def loss_difference(reference: dict[str, float], other: dict[str, float]) -> tup
 
 
 def parameters(module: th.nn.Module) -> dict[str, th.Tensor]:
-    """By name."""
+    """Get the parameters by name."""
     return dict(module.named_parameters())
 
 
 def relative_difference(reference: dict[str, th.Tensor], other: dict[str, th.Tensor]) -> tuple[float, str]:
     """
-    The greatest ||b - a|| / ||a|| of two tensors of the same name, and the name; a millionth of the norm of all of them
-    is added to the denominator, for tensors that are zero but for rounding errors.
+    Find the largest ||b - a|| / ||a|| of two tensors with the same name, and the name.
+
+    A millionth of the norm of all tensors is added to the denominator, for tensors that are zero up to rounding errors.
     """
     if reference.keys() != other.keys():
         raise ValueError(f"not in both: {sorted(reference.keys() ^ other.keys())}")
@@ -253,7 +259,7 @@ def relative_difference(reference: dict[str, th.Tensor], other: dict[str, th.Ten
 
 @contextmanager
 def exact_arithmetic() -> Iterator[None]:
-    """Without TensorFloat-32, and with convolutions that give the same bits each time."""
+    """Disable TensorFloat-32 and use deterministic convolutions."""
     cudnn, matmul = th.backends.cudnn, th.backends.cuda.matmul
     before = cudnn.allow_tf32, matmul.allow_tf32, cudnn.deterministic
     cudnn.allow_tf32, matmul.allow_tf32, cudnn.deterministic = False, False, True
@@ -264,7 +270,7 @@ def exact_arithmetic() -> Iterator[None]:
 
 
 def host_times(step: Step, repeats: int = 20) -> Row:
-    """How long the host is busy with one update, of the time until the GPU has finished it."""
+    """Measure how long the host is busy with one update, and its share of the time until the GPU has finished."""
     host, whole = [], []
     for _ in range(repeats):
         synchronize()
@@ -278,7 +284,7 @@ def host_times(step: Step, repeats: int = 20) -> Row:
 
 
 def kernels(step: Step, repeats: int = 5) -> Row:
-    """How many kernels an update launches, and the milliseconds that the GPU spends in them."""
+    """Count the kernels of an update, and the milliseconds that the GPU spends in them."""
     with th.profiler.profile(activities=[th.profiler.ProfilerActivity.CUDA]) as profiler:
         for _ in range(repeats):
             step()
@@ -298,14 +304,15 @@ def measure(
     image_size: int, batch_size: int, precision: str, rounds: int, device: str, compile: bool = False
 ) -> tuple[list[Row], dict[tuple[str, str], Step]]:
     """
-    One row for every contender, and their updates by name and storage.
+    Measure the contenders.
 
-    :param image_size: pixels along each side
-    :param batch_size: of an update
-    :param precision: of HAVESAC's encoders
-    :param rounds: timed visits to each contender, of ten updates each on a GPU
-    :param device: "cuda", or "cpu" where nothing is recorded
-    :param compile: HAVESAC's
+    :param image_size: Height and width of the images [px]
+    :param batch_size: Batch size of an update
+    :param precision: Precision of HAVESAC's encoders
+    :param rounds: Number of rounds, with ten updates each on a GPU
+    :param device: "cuda", or "cpu", where no graph is recorded
+    :param compile: Whether HAVESAC compiles its modules
+    :return: One row per contender, and their updates by name and storage
     """
     env = make_env(TWO, image_size)
     contenders: dict[tuple[str, str], Step] = {}
@@ -326,7 +333,7 @@ def measure(
             for _ in range(graphed.warm_up + 2):
                 graphed()
             synchronize()
-        except Exception:  # the others are measured all the same
+        except Exception:  # measure the others in any case
             traceback.print_exc()
             error = traceback.format_exc().strip().splitlines()[-1]
             rows.append({"contender": "HAVESAC graph", "storage": storage, "error": error})
@@ -351,14 +358,14 @@ def measure(
 
 
 def filled(env: VecEnv, precision: str, device: str, kwargs: dict[str, Any]) -> HAVESAC:
-    """HAVESAC with transitions to train on."""
+    """Create a HAVESAC model with transitions to train on."""
     model = have_sac(env, precision, device, **kwargs)
     ready([model], env)
     return model
 
 
 def goals(rows: Sequence[Row]) -> list[str]:
-    """Which goals are met, in words."""
+    """Format which goals are met."""
     lines = []
     for row in rows:
         name, ratio = row["contender"], row["vs_sb3"]
@@ -380,7 +387,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--batch-sizes", type=int, nargs="+", default=[128, 512])
     parser.add_argument("--precision", default="bfloat16", choices=("float32", "bfloat16"))
     parser.add_argument("--rounds", type=int, default=15)
-    parser.add_argument("--compile", action="store_true", help="HAVESAC(compile=True)")
+    parser.add_argument("--compile", action="store_true", help="use HAVESAC(compile=True)")
     parser.add_argument("--output", type=Path, default=RESULTS / "gpu" / "graph.csv")
     args = parser.parse_args(arguments)
     th.set_num_threads(1)
@@ -397,7 +404,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         save([{**row, **about} for row in rows], args.output, GROUP)
     if args.device == "cpu":
         return
-    for rows, steps in measured:  # last, as the profiler may change what comes after it
+    for rows, steps in measured:  # last, because the profiler may affect later measurements
         for row in rows:
             if row["error"] is None:
                 row.update(kernels(steps[row["contender"], row["storage"]]))

@@ -1,13 +1,13 @@
-"""Training runs side by side on one GPU, each on a processor core of its own, for as long as there is time.
+"""Train in parallel on one GPU, with a processor core per run, for a limited time.
 
     python -m benchmarks.gpu.training --seconds 150 --output training.csv
     python -m benchmarks.gpu.training --device cpu --seconds 60 --configs have --seeds 0     # tries the script
 
-Every run is a process ``python -m sb3_have.train`` in a folder of its own below ``--runs``, from whose newest
-checkpoint the next call goes on. A row for each run, written when it ends: steps and seconds so far, steps per second,
-episodes, mean distance and return of the last ten; nothing is evaluated. The curves (``monitor.csv``, ``progress.csv``)
-of all runs are packed into ``curves.tar.gz`` beside the rows; checkpoints hold the replay buffer and stay where they
-are.
+Every run is a process ``python -m sb3_have.train`` with its own folder in ``--runs``, and continues from the newest
+checkpoint in it. When a run ends, the script writes a row with its steps, seconds, steps per second, episodes, and mean
+distance and return of the last ten episodes; there are no evaluations. The curves of all runs (``monitor.csv``,
+``progress.csv``) are packed into ``curves.tar.gz`` next to the rows. Checkpoints, which include the replay buffer, stay
+in their folders.
 """
 
 from __future__ import annotations
@@ -29,12 +29,14 @@ from sb3_have.checkpoint.checkpoint import checkpoint_info, checkpoints
 
 CONFIGS = ("have", "lve", "gve", "rgb", "event")
 LAST_EPISODES = 10
-START = 20  # seconds until a process trains
-SAVE = 30  # seconds that writing all checkpoints at once may take
+# Seconds until a process starts to train
+START = 20
+# Seconds that it may take to write all checkpoints at once
+SAVE = 30
 
 
 def start(folder: Path, config: str, seed: int, core: int, seconds: float, device: str) -> subprocess.Popen[bytes]:
-    """A training process, its output in ``log.txt`` of its folder."""
+    """Start a training process that writes its output to ``log.txt`` in its folder."""
     folder.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, "-m", "sb3_have.train", "--config", config, "--seed", str(seed), "--out", str(folder)]
     command += ["--device", device, "--time-limit", str(seconds), "--eval-freq", "0", "--save-freq", "1000000"]
@@ -46,7 +48,7 @@ def start(folder: Path, config: str, seed: int, core: int, seconds: float, devic
 
 
 def result(folder: Path, exit_code: int | None) -> Row:
-    """Progress of a run."""
+    """Read the progress of a run."""
     newest = max((checkpoint_info(path) for path in checkpoints(folder)), key=lambda info: info["steps"], default=None)
     row: Row = {"exit_code": exit_code, "steps": None, "seconds": None, "steps_per_s": None}
     if newest is not None:
@@ -63,8 +65,8 @@ def result(folder: Path, exit_code: int | None) -> Row:
         row["distance"] = round(float(last["distance"].mean()), 1) if "distance" in last else None
     if exit_code != 0:
         log = folder / "log.txt"
-        said = log.read_text(errors="replace").strip().splitlines() if log.exists() else []
-        row["error"] = said[-1] if said else f"exit code {exit_code}"
+        output = log.read_text(errors="replace").strip().splitlines() if log.exists() else []
+        row["error"] = output[-1] if output else f"exit code {exit_code}"
     return row
 
 
@@ -72,14 +74,15 @@ def train(
     configs: Sequence[str], seeds: Sequence[int], runs: Path, seconds: float, device: str, output: Path
 ) -> list[Row]:
     """
-    Run all of them at once, and write their rows.
+    Make all runs at once and write their rows.
 
-    :param configs: in ``zoo_configs``
-    :param seeds: each with every configuration
-    :param runs: folder of the runs' folders
-    :param seconds: in all; a process that has not ended by then is stopped
-    :param device: of the models
+    :param configs: Names of configurations in ``zoo_configs``
+    :param seeds: Seeds for each configuration
+    :param runs: Folder for the folders of the runs
+    :param seconds: Total time; a process that is still running then is killed
+    :param device: Device of the models
     :param output: CSV file of the rows
+    :return: The rows
     """
     deadline = time.monotonic() + seconds
     cores = sorted(os.sched_getaffinity(0))
@@ -116,7 +119,7 @@ def train(
 
 
 def pack(runs: Path, archive: Path) -> None:
-    """The curves and logs of all runs."""
+    """Pack the curves and logs of all runs."""
     with tarfile.open(archive, "w:gz") as packed:
         for path in sorted(runs.rglob("*")):
             if path.is_file() and path.suffix in (".csv", ".txt"):
@@ -126,7 +129,7 @@ def pack(runs: Path, archive: Path) -> None:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device", default="cuda")
-    parser.add_argument("--seconds", type=float, default=150, help="in all")
+    parser.add_argument("--seconds", type=float, default=150, help="total time")
     parser.add_argument("--configs", nargs="+", default=list(CONFIGS))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--runs", type=Path, default=Path("runs") / "gpu")
