@@ -10,16 +10,13 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 
-OBSERVATIONS = ("observations", "next_observations")
-"""What SB3's buffers hold their observations in: arrays (buffer_size, n_envs, ...), or dicts of such."""
-
 
 def filled_part(buffer: ReplayBuffer) -> ReplayBuffer:
-    """A buffer to write: of observations it has only what has been stored, and shares the memory.
+    """Return a copy whose observations are cut to what has been stored; it shares the memory.
 
-    :param buffer: of any class; those without SB3's arrays are returned as they are
+    :param buffer: Buffer of any class; one without SB3's arrays is returned as it is
     """
-    # with `optimize_memory_usage` the row after the last transition is its next observation
+    # With `optimize_memory_usage` the row after the last transition is its next observation
     n_rows = buffer.pos + 1
     if buffer.full or n_rows >= buffer.buffer_size:
         return buffer
@@ -27,7 +24,7 @@ def filled_part(buffer: ReplayBuffer) -> ReplayBuffer:
 
 
 def at_full_size(part: ReplayBuffer) -> ReplayBuffer:
-    """The buffer of :func:`filled_part`, with room for all of ``buffer_size``; one array after the other is copied."""
+    """Undo :func:`filled_part`; one array after the other is copied."""
 
     def extended(array: np.ndarray) -> np.ndarray:
         full = np.zeros((part.buffer_size, *array.shape[1:]), array.dtype)
@@ -39,31 +36,31 @@ def at_full_size(part: ReplayBuffer) -> ReplayBuffer:
 
 
 def _with_observations(buffer: ReplayBuffer, n_rows: int, change: Callable[[np.ndarray], np.ndarray]) -> ReplayBuffer:
-    """A shallow copy in which the observations' arrays of so many rows are changed."""
+    """Return a shallow copy with changed observations, where they are arrays (n_rows, n_envs, ...) or dicts of such."""
 
     def changed(array: Any) -> Any:
         fits = isinstance(array, np.ndarray) and array.shape[:2] == (n_rows, buffer.n_envs)
         return change(array) if fits else array
 
     other = copy.copy(buffer)
-    for name in OBSERVATIONS:
-        value = vars(buffer).get(name)
+    for name in vars(buffer).keys() & {"observations", "next_observations"}:
+        value = getattr(buffer, name)
         if isinstance(value, dict):
-            vars(other)[name] = {key: changed(array) for key, array in value.items()}
-        elif value is not None:
-            vars(other)[name] = changed(value)
+            setattr(other, name, {key: changed(array) for key, array in value.items()})
+        else:
+            setattr(other, name, changed(value))
     return other
 
 
 def end_last_episode(buffer: ReplayBuffer) -> None:
-    """Let no return and no next observation run from the last transition into what is stored next."""
+    """End the last episode, so that no return and no next observation reaches into what is stored next."""
     if hasattr(buffer, "truncate_last_trajectory"):
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="The last trajectory in the replay buffer will be truncated")
             buffer.truncate_last_trajectory()
     elif buffer.size() > 0 and (buffer.optimize_memory_usage or isinstance(buffer, NStepReplayBuffer)):
         last = buffer.pos - 1
+        # Without handling of timeouts the cut is a termination, as in SB3's `learn`
         if buffer.handle_timeout_termination:
             buffer.timeouts[last] = np.maximum(buffer.timeouts[last], 1 - buffer.dones[last])
-        # without that a cut is a termination, as SB3 makes it when `learn` begins anew
         buffer.dones[last] = 1
