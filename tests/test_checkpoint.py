@@ -28,7 +28,7 @@ from sb3_have.checkpoint import (
     save_checkpoint,
 )
 from sb3_have.checkpoint.env_state import environments_state, restore_environments
-from sb3_have.checkpoint.stopping import TrainingStopped
+from sb3_have.checkpoint.stopping import TrainingStopped, stop_training
 from sb3_have.common.crossq import MultiInputCrossQ
 
 
@@ -202,8 +202,7 @@ def test_training_stopped_between_rollouts(tmp_path: Path, freq: int) -> None:
     class Stops(BaseCallback):
         def _on_rollout_start(self) -> None:
             if self.model.num_timesteps == 30:
-                self.locals["callback"].on_training_end()
-                raise TrainingStopped
+                stop_training(self)
 
         def _on_step(self) -> bool:
             return True

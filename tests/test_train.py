@@ -204,7 +204,7 @@ def test_interrupted_evaluation_is_made_up_for(
         if moment == "within":
             patch.setattr(callback, "evaluate", lambda *args, **kwargs: press_ctrl_c())
         with acting_at(10, press_ctrl_c if moment == "before" else lambda: None):
-            assert run.train(steps).num_timesteps == 10 + (moment == "within" and steps == 20)
+            assert run.train(steps).num_timesteps == 10
     assert run.interrupted and not (tmp_path / "evaluation.csv").exists()
     again = make_run(tmp_path)
     again.train(steps)

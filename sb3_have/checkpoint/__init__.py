@@ -18,7 +18,7 @@ from sb3_have.checkpoint.checkpoint import (
 from sb3_have.checkpoint.env_state import ResumableEnv
 from sb3_have.checkpoint.files import locked, write_atomically
 from sb3_have.checkpoint.random_state import random_states, same_random_numbers, set_random_states
-from sb3_have.checkpoint.stopping import StopTrainingOnSignal, handle_signals
+from sb3_have.checkpoint.stopping import StopTrainingOnSignal, handle_signals, stop_training
 
 __all__ = [
     "DamagedCheckpointError",
@@ -36,5 +36,6 @@ __all__ = [
     "same_random_numbers",
     "save_checkpoint",
     "set_random_states",
+    "stop_training",
     "write_atomically",
 ]

@@ -8,12 +8,19 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from types import FrameType, TracebackType
+from typing import NoReturn
 
 from stable_baselines3.common.callbacks import BaseCallback
 
 
 class TrainingStopped(Exception):
     """Leaves ``learn`` between two rollouts; a callback that returns False would lose the last transition."""
+
+
+def stop_training(callback: BaseCallback) -> NoReturn:
+    """End ``learn`` in a callback's ``_on_rollout_start``, where no transition is lost."""
+    callback.locals["callback"].on_training_end()
+    raise TrainingStopped
 
 
 @contextmanager
@@ -74,8 +81,7 @@ class StopTrainingOnSignal(BaseCallback):
             return  # make at least one rollout
         time_is_over = self.time_limit is not None and time.monotonic() - self._started > self.time_limit
         if self.interrupted or time_is_over:
-            self.locals["callback"].on_training_end()
-            raise TrainingStopped
+            stop_training(self)
 
     def _on_step(self) -> bool:
         return True

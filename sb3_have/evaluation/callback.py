@@ -15,7 +15,7 @@ import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from sb3_have.checkpoint import handle_signals, same_random_numbers, write_atomically
+from sb3_have.checkpoint import handle_signals, same_random_numbers, stop_training, write_atomically
 from sb3_have.evaluation.evaluation import evaluate
 
 # The same for all runs, so that their evaluations drive the same episodes
@@ -90,7 +90,8 @@ class WeatherEvalCallback(BaseCallback):
         self._last_step = max((int(row.partition(",")[0]) for row in kept), default=0)
 
     def _on_rollout_start(self) -> None:
-        self._evaluate_if_due()
+        if not self._evaluate_if_due():
+            stop_training(self)
 
     def _on_step(self) -> bool:
         return True
@@ -100,10 +101,13 @@ class WeatherEvalCallback(BaseCallback):
         if self.model.num_timesteps >= self.locals["total_timesteps"]:
             self._evaluate_if_due()
 
-    def _evaluate_if_due(self) -> None:
+    def _evaluate_if_due(self) -> bool:
+        """
+        :return: Whether it was not interrupted
+        """
         step = self.model.num_timesteps
         if self.eval_freq <= 0 or step // self.eval_freq == self._last_step // self.eval_freq:
-            return
+            return True
         signals: list[int] = []
 
         def interrupt(number: int, frame: FrameType | None) -> None:
@@ -113,12 +117,14 @@ class WeatherEvalCallback(BaseCallback):
         try:
             with handle_signals(interrupt), same_random_numbers():
                 self._append(step)
-            self._last_step = step
         except KeyboardInterrupt:
             if not signals:
                 raise
-            # Leave the rest to the handler of the training
+            # Pass the signal on to the handler that was there before
             signal.raise_signal(signals[0])
+            return False
+        self._last_step = step
+        return True
 
     def _append(self, step: int) -> None:
         """Evaluate the model and append a row per weather."""
