@@ -37,10 +37,9 @@ from sb3_have.checkpoint import (
     checkpoint_step,
     checkpoints,
     load_checkpoint,
-    locked,
     newest_checkpoint,
-    write_atomically,
 )
+from sb3_have.checkpoint.files import locked, write_atomically
 from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
 from sb3_have.common.crossq import MultiInputCrossQ
 from sb3_have.common.memory import keep_freed_memory

@@ -17,7 +17,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_have import ModalityReplayBuffer
-from sb3_have.checkpoint import ResumableCheckpointCallback, checkpoints, load_checkpoint, random_states
+from sb3_have.checkpoint import ResumableCheckpointCallback, checkpoints, load_checkpoint
+from sb3_have.checkpoint.random_state import random_states
 
 
 def leaves(value: Any, path: str = "") -> dict[str, np.ndarray]:

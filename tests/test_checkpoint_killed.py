@@ -14,7 +14,7 @@ from killed_training import SAVE_FREQ, STEPS
 from resuming import assert_same, everything
 
 from sb3_have.checkpoint import checkpoint_step, checkpoints
-from sb3_have.checkpoint.archive import check_archive
+from sb3_have.checkpoint.archive import damage
 
 N_KILLS = 20
 
@@ -54,7 +54,7 @@ def test_killed_again_and_again(tmp_path: Path) -> None:
             done += written * SAVE_FREQ
             assert max(map(checkpoint_step, checkpoints(folder)), default=0) == done < STEPS, moment
             for path in checkpoints(folder):
-                check_archive(path)
+                assert damage(path) is None
             if moment == "byte":
                 assert len([*folder.glob("*.partial")]) == 1
     assert min(parts_written) < 0.1 and max(parts_written) > 0.9

@@ -18,12 +18,11 @@ from sb3_have.checkpoint import (
     ResumableCheckpointCallback,
     checkpoints,
     load_checkpoint,
-    locked,
-    random_states,
     save_checkpoint,
-    set_random_states,
 )
 from sb3_have.checkpoint import callback as callback_module
+from sb3_have.checkpoint.files import locked
+from sb3_have.checkpoint.random_state import random_states, set_random_states
 
 
 def make_model(env: Any = None, algorithm: Any = SAC, **kwargs: Any) -> Any:
@@ -95,10 +94,7 @@ def test_folder_is_for_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with (tmp_path / ".lock").open("w") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
         (tmp_path / "checkpoint-20").write_bytes(b"unfinished, of the other process")
-        with pytest.raises(
-            BlockingIOError,
-            match=r"another process works in.*; .*a notebook keeps the folder until its kernel is restarted",
-        ):
+        with pytest.raises(BlockingIOError, match="another process works in"):
             make_model().learn(9, callback)
     with pytest.raises(ZeroDivisionError):
         make_model().learn(9, [callback, Fails()])

@@ -1,4 +1,4 @@
-"""Replay buffers in checkpoints: no larger than what is in them, and cut where new episodes begin."""
+"""Replay buffers in checkpoints, cut where new episodes begin."""
 
 import threading
 import warnings
@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from resuming import Drifting, assert_same, leaves
+from resuming import Drifting
 from stable_baselines3 import SAC, HerReplayBuffer
-from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.envs import BitFlippingEnv, SimpleMultiObsEnv
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.envs import BitFlippingEnv
 
 from sb3_have import ModalityReplayBuffer
 from sb3_have.checkpoint import load_checkpoint, save_checkpoint
-from sb3_have.checkpoint.replay_state import at_full_size, end_last_episode, filled_part
+from sb3_have.checkpoint.checkpoint import end_last_episode
 
 KINDS: dict[str, tuple[type[ReplayBuffer], dict[str, Any]]] = {
     "n steps": (NStepReplayBuffer, {"n_steps": 3, "gamma": 1.0}),
@@ -73,50 +73,9 @@ def test_empty_buffer_is_not_cut(kind: str) -> None:
     assert not buffer.dones.any() and not buffer.timeouts.any()
 
 
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("n_steps", [0, 2, SIZE - 1, SIZE, SIZE + 2])
-def test_filled_part(kind: str, n_steps: int) -> None:
-    buffer = make_buffer(kind)
-    for step in range(n_steps):
-        add(buffer, step)
-    part = filled_part(buffer)
-    rest = at_full_size(part)
-    if kind != "frames once":
-        assert len(part.observations) == min(n_steps + 1, SIZE) and len(buffer.observations) == SIZE
-        assert np.shares_memory(part.observations, buffer.observations)
-    for step in range(n_steps, n_steps + SIZE + 1):
-        for one in (buffer, rest):
-            np.random.seed(step)
-            add(one, step)
-        samples = []
-        for one in (buffer, rest):
-            np.random.seed(step)
-            samples.append(leaves(one.sample(8)))
-        assert_same(*samples)
-
-
 def sac(env: Any, policy: str = "MultiInputPolicy", **kwargs: Any) -> SAC:
     policy_kwargs = {"net_arch": [4]}
     return SAC(policy, env, policy_kwargs=policy_kwargs, learning_starts=99, seed=0, device="cpu", **kwargs)
-
-
-@pytest.mark.parametrize("kind", [DictReplayBuffer, HerReplayBuffer])
-def test_file_has_the_filled_part(kind: type[ReplayBuffer], tmp_path: Path) -> None:
-    def make_env() -> Any:
-        if kind is HerReplayBuffer:
-            return BitFlippingEnv(n_bits=3, continuous=True, max_steps=5)
-        return SimpleMultiObsEnv(discrete_actions=False, random_start=False)
-
-    model = sac(make_env(), buffer_size=3000, replay_buffer_class=kind).learn(20)
-    assert isinstance(model.replay_buffer, DictReplayBuffer)
-    save_checkpoint(model, tmp_path / "mine")
-    n_bytes = sum(array.nbytes for array in model.replay_buffer.observations.values())
-    if kind is DictReplayBuffer:
-        assert (tmp_path / "mine").stat().st_size < n_bytes, "twice that is reserved"
-    loaded = load_checkpoint(tmp_path / "mine", make_env(), device="cpu").replay_buffer
-    for name in ("observations", "next_observations"):
-        assert_same(leaves(getattr(loaded, name)), leaves(getattr(model.replay_buffer, name)))
-        assert all(array.flags.writeable for array in getattr(loaded, name).values())
 
 
 def test_no_second_buffer_is_created(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -21,7 +21,8 @@ from resuming import assert_same, everything, leaves
 
 import sb3_have
 from sb3_have import train
-from sb3_have.checkpoint import StopTrainingOnSignal, checkpoints, locked, newest_checkpoint, save_checkpoint
+from sb3_have.checkpoint import StopTrainingOnSignal, checkpoints, newest_checkpoint, save_checkpoint
+from sb3_have.checkpoint.files import locked
 from sb3_have.configuration import load_config, model_kwargs
 from sb3_have.evaluation import callback
 from sb3_have.train import Run, make_training_env

@@ -29,7 +29,8 @@ from sb3_have.benchmark.grid import Failures, Job
 from sb3_have.benchmark.machine import machine
 from sb3_have.benchmark.reading import FILES
 from sb3_have.benchmark.results import difference, read_text_table, settings_column
-from sb3_have.checkpoint import checkpoint_step, checkpoints, locked, write_atomically
+from sb3_have.checkpoint import checkpoint_step, checkpoints
+from sb3_have.checkpoint.files import locked, write_atomically
 from sb3_have.configuration import Env, env_wrapper, evaluation_env_kwargs
 from sb3_have.evaluation.episodes import EpisodeQueue, Task, match_observations
 from sb3_have.evaluation.evaluation import drive_tasks, episode_tasks, summarize

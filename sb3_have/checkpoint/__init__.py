@@ -16,9 +16,7 @@ from sb3_have.checkpoint.checkpoint import (
     save_checkpoint,
 )
 from sb3_have.checkpoint.env_state import ResumableEnv
-from sb3_have.checkpoint.files import locked, write_atomically
-from sb3_have.checkpoint.random_state import random_states, same_random_numbers, set_random_states
-from sb3_have.checkpoint.stopping import StopTrainingOnSignal, handle_signals, stop_training
+from sb3_have.checkpoint.stopping import StopTrainingOnSignal
 
 __all__ = [
     "DamagedCheckpointError",
@@ -28,14 +26,7 @@ __all__ = [
     "checkpoint_info",
     "checkpoint_step",
     "checkpoints",
-    "handle_signals",
     "load_checkpoint",
-    "locked",
     "newest_checkpoint",
-    "random_states",
-    "same_random_numbers",
     "save_checkpoint",
-    "set_random_states",
-    "stop_training",
-    "write_atomically",
 ]

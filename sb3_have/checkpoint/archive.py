@@ -172,15 +172,15 @@ def read_info(path: Path) -> dict[str, Any]:
         return dict(json.loads(archive.read("info.json")))
 
 
-def check_archive(path: Path) -> None:
-    """Compare all checksums.
-
-    :raises DamagedCheckpointError: If the file is truncated or a checksum is wrong
-    """
-    with _opened(path) as archive:
-        broken = archive.testzip()
-        if broken is not None:
-            raise zipfile.BadZipFile(f"Bad CRC-32 for file {broken!r}")
+def damage(path: Path) -> DamagedCheckpointError | None:
+    """Compare all checksums, and return what is wrong with a checkpoint or None."""
+    try:
+        with _opened(path) as archive:
+            if broken := archive.testzip():
+                raise zipfile.BadZipFile(f"Bad CRC-32 for file {broken!r}")
+    except DamagedCheckpointError as error:
+        return error
+    return None
 
 
 @contextmanager

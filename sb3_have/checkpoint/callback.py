@@ -13,7 +13,8 @@ from filelock import FileLock
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_have.checkpoint.checkpoint import checkpoint_step, checkpoints, damage, save_checkpoint
+from sb3_have.checkpoint.archive import damage
+from sb3_have.checkpoint.checkpoint import checkpoint_step, checkpoints, save_checkpoint
 from sb3_have.checkpoint.files import locked
 from sb3_have.checkpoint.random_state import random_states, set_random_states
 
@@ -77,29 +78,23 @@ class ResumableCheckpointCallback(BaseCallback):
         assert isinstance(self.model, OffPolicyAlgorithm)  # for mypy
         self._last_step = self._saved_step = self.model.num_timesteps
         self.folder.mkdir(parents=True, exist_ok=True)
-        # The lock remains where training failed, and is taken over by the next call of `learn`
+        # Training that failed may have left the lock to the next call of `learn`
         if self._lock is None:
-            try:
-                self._lock = locked(self.folder).lock
-            except BlockingIOError as error:
-                raise BlockingIOError(
-                    f"{error}; after an interrupted training a notebook keeps the folder until its kernel is restarted"
-                ) from None
+            self._lock = locked(self.folder).lock
         self._refuse_later_checkpoints()
         # `learn` begins by resetting the action noise
         if self._noise is not None:
             self.model.action_noise = self._noise["action_noise"]
 
     def _refuse_later_checkpoints(self) -> None:
-        later = [path for path in checkpoints(self.folder) if checkpoint_step(path) > self._last_step]
-        later = [path for path in later if damage(path) is None]
-        if later:
-            self._release()
-            raise ValueError(
-                f"{later[-1]} is later than this training, which has {self._last_step} steps. To resume from it, use "
-                "load_checkpoint and `learn(..., reset_num_timesteps=False)`; to start a new training, choose another "
-                "folder, or remove this one."
-            )
+        for path in reversed(checkpoints(self.folder)):
+            if checkpoint_step(path) > self._last_step and damage(path) is None:
+                self._release()
+                raise ValueError(
+                    f"{path} is later than this training, which has {self._last_step} steps. To resume from it, use "
+                    "load_checkpoint and `learn(..., reset_num_timesteps=False)`; to start a new training, choose "
+                    "another folder, or remove this one."
+                )
 
     def _on_rollout_start(self) -> None:
         # Save between two rollouts, where nothing is pending: in `_on_step` the transition is not stored yet, and in
@@ -114,10 +109,9 @@ class ResumableCheckpointCallback(BaseCallback):
     def _restore_rollout(self) -> None:
         """Restore what ``collect_rollouts`` has drawn before it calls the callbacks."""
         model: Any = self.model
-        if self._noise is not None and self._noise["rollout_started"]:
-            drawn = {name: noise.to(model.device) for name, noise in self._noise["exploration"].items()}
-            if drawn:
-                vars(model.actor.action_dist).update(drawn)
+        if self._noise is not None and "gsde" in self._noise:
+            drawn = {name: noise.to(model.device) for name, noise in self._noise["gsde"].items()}
+            vars(model.actor.action_dist).update(drawn)
             set_random_states(self._noise["random"])
         self._noise = None
 
@@ -164,12 +158,10 @@ class ResumableCheckpointCallback(BaseCallback):
 
     def _current_noise(self) -> dict[str, Any]:
         model: Any = self.model
-        noise = {"action_noise": model.action_noise, "rollout_started": self._rollout_started}
-        if self._rollout_started:
-            # gSDE's noise
-            drawn = vars(model.actor.action_dist) if model.use_sde else {}
-            names = drawn.keys() & {"exploration_mat", "exploration_matrices"}
-            noise["exploration"] = {name: drawn[name].detach().cpu() for name in names}
+        noise = {"action_noise": model.action_noise}
+        if self._rollout_started and model.use_sde:
+            drawn = vars(model.actor.action_dist)
+            noise["gsde"] = {name: drawn[name].detach().cpu() for name in ("exploration_mat", "exploration_matrices")}
             noise["random"] = random_states()
         return noise
 

@@ -11,15 +11,16 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import torch as th
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_have.checkpoint.archive import DamagedCheckpointError, check_archive, read_archive, read_info, write_archive
+from sb3_have.checkpoint.archive import damage, read_archive, read_info, write_archive
 from sb3_have.checkpoint.callback_state import Callbacks, callbacks_state, restore_callbacks
 from sb3_have.checkpoint.env_state import environments_state, restore_environments
 from sb3_have.checkpoint.random_state import random_states, set_random_states
-from sb3_have.checkpoint.replay_state import at_full_size, end_last_episode, filled_part
 
 
 def save_checkpoint(
@@ -52,7 +53,6 @@ def save_checkpoint(
     env = model.get_env()
     if env is None:
         raise ValueError("the model has no environment, and a checkpoint holds the environment's state; use set_env")
-    assert model.replay_buffer is not None  # for mypy
     environments = environments_state(env, (model.observation_space, model.action_space))
     if environments.lost:
         warnings.warn(
@@ -63,7 +63,7 @@ def save_checkpoint(
     state = {
         "algorithm": type(model),
         "environments": environments,
-        "replay_buffer": filled_part(model.replay_buffer),
+        "replay_buffer": model.replay_buffer,
         "callbacks": callbacks_state(callbacks),
         # Last, after everything that may draw
         "random": random_states(),
@@ -113,7 +113,7 @@ def load_checkpoint(
             raise FileNotFoundError(f"{file} has no checkpoint-<step> that can be read")
         file = newest
     _, saved, state = read_archive(file)
-    buffer = at_full_size(state.pop("replay_buffer"))
+    buffer = state["replay_buffer"]
     with warnings.catch_warnings():
         # Give SB3 the buffer, so that it does not create a second one; n-step returns are set up in it
         warnings.filterwarnings("ignore", message="`n_steps=")
@@ -129,6 +129,20 @@ def load_checkpoint(
     restore_callbacks(callbacks, state["callbacks"])
     set_random_states(state["random"])
     return model
+
+
+def end_last_episode(buffer: ReplayBuffer) -> None:
+    """End the last episode, so that no return and no next observation reaches into what is stored next."""
+    if hasattr(buffer, "truncate_last_trajectory"):
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="The last trajectory in the replay buffer will be truncated")
+            buffer.truncate_last_trajectory()
+    elif buffer.size() > 0 and (buffer.optimize_memory_usage or isinstance(buffer, NStepReplayBuffer)):
+        last = buffer.pos - 1
+        # Without handling of timeouts the cut is a termination, as in SB3's `learn`
+        if buffer.handle_timeout_termination:
+            buffer.timeouts[last] = np.maximum(buffer.timeouts[last], 1 - buffer.dones[last])
+        buffer.dones[last] = 1
 
 
 def checkpoint_info(path: str | os.PathLike[str]) -> dict[str, Any]:
@@ -148,15 +162,6 @@ def checkpoints(folder: str | os.PathLike[str]) -> list[Path]:
     """List the files ``checkpoint-<step>`` of a folder, oldest first."""
     files = [path for path in Path(folder).glob("checkpoint-*") if re.fullmatch(r"checkpoint-\d+", path.name)]
     return sorted(files, key=checkpoint_step)
-
-
-def damage(path: Path) -> DamagedCheckpointError | None:
-    """Return why a checkpoint cannot be read, or None."""
-    try:
-        check_archive(path)
-    except DamagedCheckpointError as error:
-        return error
-    return None
 
 
 def newest_checkpoint(folder: str | os.PathLike[str]) -> Path | None:

@@ -25,8 +25,6 @@ DRAWING = ("pygame", "highway_env.envs.common.graphics")
 # What is kept of an environment that cannot be pickled
 RANDOM = (np.random.Generator, np.random.RandomState, random.Random, spaces.Space)
 
-OUT_OF_REACH = "environments of SubprocVecEnv whose outermost wrapper is not sb3_have.checkpoint.ResumableEnv"
-
 
 class LayersState(NamedTuple):
     """State of an environment and its wrappers: their classes, their attributes, and what cannot be pickled."""
@@ -40,14 +38,12 @@ class EnvironmentsState(NamedTuple):
     """State of a ``VecEnv``; ``workers`` has that of environments in other processes."""
 
     layers: LayersState
-    workers: list[Any]
+    workers: list[LayersState]
 
     @property
     def lost(self) -> list[str]:
         """What could not be pickled, by class and attribute; if there is anything, new episodes begin."""
-        states = [state for state in self.workers if isinstance(state, LayersState)]
-        unreached = [OUT_OF_REACH] if len(states) < len(self.workers) else []
-        return [name for state in (self.layers, *states) for name in state.lost] + unreached
+        return [name for state in (self.layers, *self.workers) for name in state.lost]
 
 
 class ResumableEnv(gym.Wrapper[Any, Any, Any, Any]):
@@ -65,15 +61,15 @@ class ResumableEnv(gym.Wrapper[Any, Any, Any, Any]):
         """Return the state of the environment and of the process's random numbers."""
         return _capture(_gym_layers(self), (random.getstate(), np.random.get_state()))
 
-    def checkpoint_names(self) -> list[str]:
-        """Return the classes of the environment, outermost wrapper first."""
-        return _names(_gym_layers(self))
-
-    def restore_checkpoint_state(self, state: LayersState) -> None:
-        """Restore the state of :meth:`checkpoint_state`."""
-        python, numpy = _restore(_gym_layers(self), state)
+    def restore_checkpoint_state(self, state: LayersState) -> str:
+        """Restore the state of :meth:`checkpoint_state`, and return an error instead of ending the worker."""
+        try:
+            python, numpy = _restore(_gym_layers(self), state)
+        except ValueError as error:
+            return str(error)
         random.setstate(python)
         np.random.set_state(numpy)
+        return ""
 
 
 def environments_state(vec_env: VecEnv, shared: Any = None) -> EnvironmentsState:
@@ -86,13 +82,12 @@ def environments_state(vec_env: VecEnv, shared: Any = None) -> EnvironmentsState
     :param shared: Other objects that may share parts with them
     :return: The state; where it cannot be pickled, ``lost`` names the reason and only random generators are kept
     """
-    base, workers = vec_env.unwrapped, []
-    if isinstance(base, SubprocVecEnv):
-        workers = base.env_method("checkpoint_state") if _are_resumable(base) else base.get_attr("np_random")
-    state = _capture(_vec_layers(vec_env), shared)
-    if not isinstance(base, DummyVecEnv | SubprocVecEnv):
-        state.lost.append(f"{type(base).__name__} (its environments are out of reach)")
-    return EnvironmentsState(state, workers)
+    state, base = _capture(_vec_layers(vec_env), shared), vec_env.unwrapped
+    if _are_resumable(base):
+        return EnvironmentsState(state, base.env_method("checkpoint_state"))
+    if not isinstance(base, DummyVecEnv):
+        state.lost.append(f"environments of {type(base).__name__}, which need ResumableEnv as the outermost wrapper")
+    return EnvironmentsState(state, [])
 
 
 def restore_environments(vec_env: VecEnv, state: EnvironmentsState) -> Any:
@@ -107,23 +102,19 @@ def restore_environments(vec_env: VecEnv, state: EnvironmentsState) -> Any:
         raise ValueError(f"a checkpoint of {len(state.workers)} environments was given {vec_env.num_envs}")
     shared = _restore(_vec_layers(vec_env), state.layers)
     base = vec_env.unwrapped
-    if any(isinstance(worker, LayersState) for worker in state.workers):
-        # Check here, as an error in a worker would end its process
-        if not _are_resumable(base):
-            raise ValueError(f"the checkpoint has environments in ResumableEnv, and was given {OUT_OF_REACH}")
-        for names, worker in zip(base.env_method("checkpoint_names"), state.workers, strict=True):
-            _check_names(worker, names)
+    if state.workers and not _are_resumable(base):
+        raise ValueError("the checkpoint has environments in ResumableEnv, which has to be the outermost wrapper here")
     for index, worker in enumerate(state.workers):
-        if isinstance(worker, LayersState):
-            base.env_method("restore_checkpoint_state", worker, indices=index)
-        else:
-            base.set_attr("np_random", worker, indices=index)
+        if error := base.env_method("restore_checkpoint_state", worker, indices=index)[0]:
+            raise ValueError(error)
     return shared
 
 
 def _are_resumable(base: VecEnv) -> bool:
-    """Whether ``ResumableEnv`` is the outermost wrapper in all workers."""
-    return all(base.env_is_wrapped(ResumableEnv)) and set(base.env_method("class_name")) == {ResumableEnv.__name__}
+    """Whether environments are in worker processes, with ``ResumableEnv`` as the outermost wrapper."""
+    if not isinstance(base, SubprocVecEnv) or not all(base.env_is_wrapped(ResumableEnv)):
+        return False
+    return set(base.env_method("class_name")) == {ResumableEnv.__name__}
 
 
 def _vec_layers(vec_env: VecEnv) -> list[Any]:
@@ -188,21 +179,17 @@ def _failure(value: Any, layers: Sequence[Any]) -> str:
     return ""
 
 
-def _check_names(state: LayersState, names: list[str]) -> None:
-    if names != state.names:
+def _restore(layers: Sequence[Any], state: LayersState) -> Any:
+    if (names := _names(layers)) != state.names:
         raise ValueError(
             f"the checkpoint is of environments with other wrappers: {' > '.join(state.names)}, and it was given "
             f"{' > '.join(names)}; make them as in the training that wrote it"
         )
-
-
-def _restore(layers: Sequence[Any], state: LayersState) -> Any:
-    _check_names(state, _names(layers))
     states, known, shared = loads(state.pickled, layers)
-    for layer, attributes, names in zip(layers, states, known, strict=True):
+    for layer, attributes, known_names in zip(layers, states, known, strict=True):
         if not state.lost:
             # Forget what the environment has computed and kept (functools.cached_property) from its old state
-            for name in vars(layer).keys() - names:
+            for name in vars(layer).keys() - known_names:
                 del vars(layer)[name]
         vars(layer).update(attributes)
     return shared

@@ -15,7 +15,9 @@ import gymnasium as gym
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from sb3_have.checkpoint import handle_signals, same_random_numbers, stop_training, write_atomically
+from sb3_have.checkpoint.files import write_atomically
+from sb3_have.checkpoint.random_state import same_random_numbers
+from sb3_have.checkpoint.stopping import handle_signals, stop_training
 from sb3_have.evaluation.evaluation import evaluate
 
 # The same for all runs, so that their evaluations drive the same episodes
