@@ -210,13 +210,15 @@ def test_training_stopped_between_rollouts(tmp_path: Path, freq: int) -> None:
     assert_same(everything(resumed.learn(15, callback, reset_num_timesteps=False)), expected)
 
 
-@pytest.mark.parametrize("n_envs", [1, 2])
-def test_noise_after_the_end_of_training(tmp_path: Path, n_envs: int) -> None:
-    """The checkpoint at the end continues the action noise, which `learn` would reset."""
+@pytest.mark.parametrize(
+    ("kwargs", "n_envs"), [({"algorithm": TD3}, 1), ({"algorithm": TD3}, 2), ({"use_sde": True}, 1)]
+)
+def test_noise_after_the_end_of_training(tmp_path: Path, kwargs: dict[str, Any], n_envs: int) -> None:
+    """The checkpoint at the end continues the action noise, which `learn` would reset, but not gSDE's."""
 
-    def make_model() -> TD3:
-        model: TD3 = sac(drifting(n_envs), TD3, action_noise=noise(2))
-        for env in model.get_env().unwrapped.envs:  # type: ignore[union-attr]
+    def make_model() -> Any:
+        model = sac(drifting(n_envs), action_noise=noise(2), **kwargs)
+        for env in model.get_env().unwrapped.envs:
             env.action_space.seed(1)
         return model
 
