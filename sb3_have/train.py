@@ -102,7 +102,7 @@ class Run:
     :param eval_freq: Steps from one evaluation to the next, 0 for none
     :param eval_episodes: Episodes in each weather of an evaluation
     :param eval_envs: Number of environments that an evaluation drives at a time, with one ``predict`` for all of them
-    :param eval_env_kwargs: Keywords for the evaluation's environments, in addition to the configuration's
+    :param eval_env_kwargs: Keywords for the evaluation's environments, which override the configuration's
         ``env_kwargs``
     :param weathers: Weathers to evaluate in
     :param save_freq: Steps from one checkpoint to the next, 0 for only one at the end
