@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from sb3_have import envs as envs  # registers the environments
 
 if TYPE_CHECKING:
-    from sb3_have.checkpoint.checkpoint import ResumableCheckpointCallback, load_checkpoint, save_checkpoint
+    from sb3_have.checkpoint import ResumableCheckpointCallback, load_checkpoint, save_checkpoint
     from sb3_have.common.buffers import ModalityReplayBuffer
     from sb3_have.evaluation.evaluation import evaluate
     from sb3_have.evaluation.recording import Recording, record_episode
@@ -48,14 +48,14 @@ _MODULES = {
     "MultiModalCritic": "have",
     "MultiModalPolicy": "have",
     "Recording": "evaluation.recording",
-    "ResumableCheckpointCallback": "checkpoint.checkpoint",
+    "ResumableCheckpointCallback": "checkpoint",
     "evaluate": "evaluation.evaluation",
     "export_onnx": "export",
     "export_safetensors": "export",
-    "load_checkpoint": "checkpoint.checkpoint",
+    "load_checkpoint": "checkpoint",
     "load_policy": "export",
     "record_episode": "evaluation.recording",
-    "save_checkpoint": "checkpoint.checkpoint",
+    "save_checkpoint": "checkpoint",
 }
 _PACKAGES = ("checkpoint", "common", "evaluation", "export", "have", "plotting", "sensors")
 

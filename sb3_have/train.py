@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import io
 import json
+import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -28,36 +29,27 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack
 
 import sb3_have
-from sb3_have.checkpoint.checkpoint import (
+from sb3_have.checkpoint import (
+    ResumableCheckpointCallback,
+    ResumableEnv,
+    StopTrainingOnSignal,
     checkpoint_info,
+    checkpoint_step,
     checkpoints,
     load_checkpoint,
-    refuse_older_form,
-    same_random_numbers,
-    write_checkpoint,
+    newest_checkpoint,
 )
-from sb3_have.checkpoint.checkpoint import checkpoint_step as checkpoint_step
-from sb3_have.checkpoint.checkpoint import newest_checkpoint as newest_checkpoint
-from sb3_have.checkpoint.env_state import ResumableEnv
 from sb3_have.checkpoint.files import locked, write_atomically
 from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
 from sb3_have.common.crossq import MultiInputCrossQ
 from sb3_have.common.memory import keep_freed_memory
 from sb3_have.configuration import env_wrapper, evaluation_env_kwargs, hyperparameter, load_config, model_kwargs
 from sb3_have.envs.weather import WEATHERS
+from sb3_have.evaluation.callback import WeatherEvalCallback
 from sb3_have.evaluation.episodes import leave_interrupts_to_parent
-from sb3_have.evaluation.evaluation import evaluate
-from sb3_have.run_callback import RunCallback as RunCallback
-from sb3_have.run_callback import TrainingStopped, is_due
-
-EVALUATION_SEED = 1_000_000
-"""Of the episodes that evaluate a run while it trains: the same for all runs."""
 
 VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}
 """By the Zoo's names."""
-
-KEPT_CHECKPOINTS = 2
-"""Of which the older one is for the case that the newest is damaged."""
 
 
 def algorithms() -> dict[str, type[OffPolicyAlgorithm]]:
@@ -100,21 +92,22 @@ def make_training_env(env_id: str, config: Mapping[str, Any], out: Path | None =
 
 
 class Run:
-    """One training run in a folder.
+    """One training run in a folder, which resumes where it was stopped or killed.
 
     :param config: hyper-parameters, see :func:`load_config`
-    :param env_id: of the environment
-    :param out: folder; what it holds of an earlier run with the same settings is resumed
-    :param seed: of everything random; an earlier run in the folder must have had the same
+    :param env_id: Id of the environment
+    :param out: Folder of the run; an earlier run in it is resumed, and must have had the same settings
+    :param seed: Seed of everything random
     :param algo: name in :func:`algorithms`
-    :param eval_freq: steps from one evaluation to the next, 0 for none
-    :param eval_episodes: episodes in each weather of an evaluation
-    :param eval_envs: number of environments that an evaluation drives at a time, with one ``predict`` for all of them
-    :param eval_env_kwargs: for the evaluation's environments, over the configuration's ``env_kwargs``
-    :param weathers: to evaluate in
-    :param save_freq: steps from one checkpoint to the next, 0 for one at the end only
-    :param time_limit: of the training in this call [s], None for none
-    :param device: of the model
+    :param eval_freq: Steps from one evaluation to the next, 0 for none
+    :param eval_episodes: Episodes in each weather of an evaluation
+    :param eval_envs: Number of environments that an evaluation drives at a time, with one ``predict`` for all of them
+    :param eval_env_kwargs: Keywords for the evaluation's environments, which override the configuration's
+        ``env_kwargs``
+    :param weathers: Weathers to evaluate in
+    :param save_freq: Steps from one checkpoint to the next, 0 for only one at the end
+    :param time_limit: Seconds of training in this session, None for no limit
+    :param device: Device of the model
     :param eval_vec_env_cls: ``SubprocVecEnv`` steps each environment of an evaluation in a process of its own
     """
 
@@ -136,90 +129,110 @@ class Run:
         eval_vec_env_cls: type[DummyVecEnv] | type[SubprocVecEnv] = DummyVecEnv,
     ) -> None:
         self.config, self.env_id, self.out, self.seed, self.algo = dict(config), env_id, Path(out), seed, algo
-        self.eval_freq, self.eval_episodes = eval_freq, eval_episodes
-        self.eval_envs, self.eval_vec_env_cls = eval_envs, eval_vec_env_cls
+        self.save_freq, self.time_limit, self.device = save_freq, time_limit, device
         env_kwargs = {**config.get("env_kwargs", {}), **(eval_env_kwargs or {})}
-        self.eval_env_kwargs = evaluation_env_kwargs({"env_kwargs": env_kwargs})
-        self.weathers, self.save_freq, self.time_limit = weathers, save_freq, time_limit
-        self.device = device
-        self.seconds = 0.0  # spent training and evaluating, over all sessions
-        self.interrupted = False
-        self._rollout_started = self._in_mid_rollout = False
-        self._saved_step = -1
-        self._progress_bar = False
+        self._make_evaluation = partial(
+            WeatherEvalCallback,
+            env_id,
+            weathers,
+            self.out / "evaluation.csv",
+            eval_freq=eval_freq,
+            n_eval_episodes=eval_episodes,
+            env_kwargs=evaluation_env_kwargs({"env_kwargs": env_kwargs}),
+            env_wrapper=env_wrapper(self.config),
+            n_envs=eval_envs,
+            vec_env_cls=eval_vec_env_cls,
+            verbose=1,
+        )
+        # Seconds of training and evaluation over all sessions, and whether a signal ended the last one
+        self.seconds, self.interrupted = 0.0, False
 
     def train(self, steps: int, progress_bar: bool = False, keep_checkpoint: bool = True) -> OffPolicyAlgorithm:
         """Train up to a number of steps, from the newest checkpoint if there is one.
 
-        :param steps: in all, earlier sessions included
-        :param progress_bar: SB3's, and one for each evaluation
-        :param keep_checkpoint: whether to write the replay buffer at the end, so that the run can go on
-        :return: the model; also saved as ``model.zip``
-        :raises BlockingIOError: if another process works in the folder
-        :raises ValueError: if the folder is of another run, or of one that cannot go on
+        :param steps: Training steps over all sessions
+        :param progress_bar: Whether to show SB3's progress bar, and one for each evaluation
+        :param keep_checkpoint: Whether to save checkpoints, with which the run can be resumed
+        :return: The model, which is also saved as ``model.zip``
+        :raises BlockingIOError: If another process works in the folder
+        :raises ValueError: If the folder is of another run, or of one that cannot be resumed
         """
-        self._progress_bar = progress_bar
         self.out.mkdir(parents=True, exist_ok=True)
         with locked(self.out):
-            return self._train(steps, keep_checkpoint)
+            checkpoint = self._checkpoint_to_resume()
+            env = make_training_env(self.env_id, self.config, self.out)
+            try:
+                return self._train(checkpoint, env, steps, progress_bar, keep_checkpoint)
+            finally:
+                env.close()
 
-    def _train(self, steps: int, keep_checkpoint: bool) -> OffPolicyAlgorithm:
-        refuse_older_form(self.out)
-        checkpoint = newest_checkpoint(self.out)
-        if checkpoint is None and (damaged := checkpoints(self.out)):
-            raise ValueError(f"all checkpoints are damaged ({damaged[-1]} and before); remove them to begin anew")
-        if checkpoint is None and (self.out / "model.zip").exists():
-            raise ValueError(
-                f"{self.out} has a model.zip but no checkpoint to go on from, and training would begin anew, over it; "
-                "choose another folder, or remove this one (a benchmark keeps checkpoints with --keep-checkpoints)"
-            )
-        done = 0 if checkpoint is None else checkpoint_step(checkpoint)
-        self._saved_step = done
-        if checkpoint is not None:
-            self._check_same_run(checkpoint)
-        self._forget_after(done)
-        env = make_training_env(self.env_id, self.config, self.out)
+    def _train(
+        self, checkpoint: Path | None, env: VecEnv, steps: int, progress_bar: bool, keep_checkpoint: bool
+    ) -> OffPolicyAlgorithm:
+        stop = StopTrainingOnSignal(self.time_limit)
+        callbacks = [stop, self._make_evaluation(seconds_before=self.seconds, progress_bar=progress_bar)]
+        if keep_checkpoint:
+            callbacks.insert(0, ResumableCheckpointCallback(self.out, self.save_freq, info=self._info))
+
+        if checkpoint is None:
+            model = self._make_model(env)
+        else:
+            model = load_checkpoint(checkpoint, env, callbacks, self.device)
+        logger = configure(str(self.out / f"log-{model.num_timesteps}"), ["csv"])
+        model.set_logger(logger)
+        self._started = time.monotonic()
         try:
-            model = self._make_model(checkpoint, env)
-            self.evaluate_if_due(model)
-            if done < steps:
-                self._learn(model, steps - done)
-            if self._in_mid_rollout:
-                return model  # what is on disk is whole
-            if keep_checkpoint and model.num_timesteps > done:
-                self.save(model, self._rollout_started)
+            with stop:
+                model.learn(
+                    max(0, steps - model.num_timesteps),
+                    callbacks,
+                    reset_num_timesteps=checkpoint is None,
+                    progress_bar=progress_bar,
+                )
         finally:
-            env.close()
+            self.seconds += time.monotonic() - self._started
+            logger.close()
+        self.interrupted = stop.interrupted
         write_atomically(self.out / "model.zip", model.save)
         return model
 
-    def _learn(self, model: OffPolicyAlgorithm, steps: int) -> None:
-        done = model.num_timesteps
-        self._rollout_started = self._in_mid_rollout = False
-        callback, logger = RunCallback(self), configure(str(self.out / f"log-{done}"), ["csv"])
-        model.set_logger(logger)
-        try:
-            model.learn(steps, callback=callback, reset_num_timesteps=done == 0, progress_bar=self._progress_bar)
-        except TrainingStopped:
-            self._rollout_started = True
-        except KeyboardInterrupt:  # the second one: the first ends the training by itself
-            self._in_mid_rollout = True
-        finally:
-            callback.restore_handlers()
-            logger.close()
-        self.interrupted = callback.stopping or self._in_mid_rollout
-
-    def _check_same_run(self, checkpoint: Path) -> None:
-        state = checkpoint_info(checkpoint)["info"]
-        now = self._settings()
-        if (settings := state.get("settings")) != now:
-            raise ValueError(f"{checkpoint} is of a run with {settings}, not {now}; choose another folder")
-        self.seconds = state["seconds"]
-
-    def _make_model(self, checkpoint: Path | None, env: VecEnv) -> OffPolicyAlgorithm:
+    def _checkpoint_to_resume(self) -> Path | None:
+        """Find the newest checkpoint of this run, and drop what was recorded after it: that is repeated."""
+        checkpoint = newest_checkpoint(self.out)
         if checkpoint is not None:
-            resumed: OffPolicyAlgorithm = load_checkpoint(checkpoint, env, device=self.device)
-            return resumed
+            info, settings = checkpoint_info(checkpoint)["info"], self._settings()
+            if info.get("settings") != settings:
+                raise ValueError(
+                    f"{checkpoint} is of a run with {info.get('settings')}, not {settings}; choose another folder"
+                )
+            self.seconds = info["seconds"]
+            for path in self.out.glob("*monitor.csv"):
+                self._drop_episodes(path, checkpoint_step(checkpoint))
+            return checkpoint
+        if damaged := checkpoints(self.out):
+            raise ValueError(f"all checkpoints are damaged ({damaged[-1]} and before); remove them to start again")
+        if (self.out / "model.zip").exists():
+            raise ValueError(
+                f"{self.out} has a model.zip but no checkpoint to resume from, and a new training would overwrite it; "
+                "choose another folder, or remove this one (a benchmark keeps checkpoints with --keep-checkpoints)"
+            )
+        # Every run has this folder before it records anything
+        log = self.out / "log-0"
+        recorded = [*self.out.glob("*monitor.csv"), *self.out.glob("evaluation.csv")]
+        if recorded and not log.exists():
+            raise ValueError(f"{recorded[0]} is of no run of this program; remove it, or choose another folder")
+        log.mkdir(exist_ok=True)
+        for path in recorded:
+            path.unlink()
+        return None
+
+    def _drop_episodes(self, monitor: Path, step: int) -> None:
+        head, *lines = monitor.read_text().splitlines(keepends=True)
+        rows = pd.read_csv(io.StringIO("".join(lines)))
+        kept = int((rows["l"].cumsum() <= step / self.config.get("n_envs", 1)).sum())
+        write_atomically(monitor, partial(Path.write_text, data="".join([head, *lines[: kept + 1]])))
+
+    def _make_model(self, env: VecEnv) -> OffPolicyAlgorithm:
         kwargs = model_kwargs(self.config)
         if self.algo != "havesac" and "replay_buffer_class" not in kwargs:  # as HAVESAC has by default
             derived = {"n_stack": stacked_frames(env), "n_steps": kwargs.pop("n_steps", 1)}
@@ -233,71 +246,9 @@ class Run:
         settings = {"config": config, "env_id": self.env_id, "seed": self.seed, "algo": self.algo}
         return dict(json.loads(json.dumps(settings)))
 
-    def _forget_after(self, step: int) -> None:
-        """Drop what was recorded after the checkpoint that is resumed: it will be lived through again."""
-        recorded = [*self.out.glob("*monitor.csv"), *self.out.glob("evaluation.csv")]
-        if step == 0:
-            log = self.out / "log-0"  # every run has it, before it records anything
-            if recorded and not log.exists():
-                raise ValueError(f"{recorded[0]} is of no run of this program; remove it, or choose another folder")
-            log.mkdir(exist_ok=True)
-            for path in recorded:
-                path.unlink()
-            return
-        for path in recorded:
-            if path.name == "evaluation.csv":
-                rows = pd.read_csv(path)
-                write_atomically(path, partial(rows[rows["step"] <= step].to_csv, index=False))
-                continue
-            head, *lines = path.read_text().splitlines(keepends=True)
-            rows = pd.read_csv(io.StringIO("".join(lines)))
-            kept = int((rows["l"].cumsum() <= step / self.config.get("n_envs", 1)).sum())
-            write_atomically(path, partial(Path.write_text, data="".join([head, *lines[: kept + 1]])))
-
-    def save(self, model: Any, rollout_started: bool = False) -> None:
-        """Write ``checkpoint-<step>``, unless it exists already."""
-        if model.num_timesteps != self._saved_step:  # a file of that name may be a damaged one
-            info = {"seconds": self.seconds, "settings": self._settings()}
-            if write_checkpoint(self.out, model, KEPT_CHECKPOINTS, info=info, rollout_started=rollout_started):
-                self._saved_step = model.num_timesteps
-
-    def evaluate_if_due(self, model: Any) -> None:
-        """Evaluate, if there is no evaluation since the last multiple of ``eval_freq``; the training does not notice.
-
-        :param model: between two rollouts
-        """
-        path = self.out / "evaluation.csv"
-        last_step = int(max(pd.read_csv(path)["step"], default=0)) if path.exists() else 0
-        if is_due(self.eval_freq, model.num_timesteps, last_step):
-            with same_random_numbers():
-                self.evaluate(model, model.num_timesteps)
-
-    def evaluate(self, model: Any, step: int) -> None:
-        """Append a row per weather to ``evaluation.csv`` and print their mean."""
-        frame = evaluate(
-            model,
-            self.env_id,
-            self.weathers,
-            self.eval_episodes,
-            EVALUATION_SEED,
-            self.eval_env_kwargs,
-            n_envs=self.eval_envs,
-            env_wrapper=env_wrapper(self.config),
-            progress_bar=self._progress_bar,
-            vec_env_cls=self.eval_vec_env_cls,
-        )
-        frame.insert(0, "step", step)
-        frame.insert(1, "seed", self.seed)
-        frame.insert(2, "wall_time", round(self.seconds, 1))
-        path = self.out / "evaluation.csv"
-        before = path.read_text() if path.exists() else ""
-        rows = frame.to_csv(header=not before, index=False, lineterminator="\n")
-        write_atomically(path, partial(Path.write_text, data=before + rows))
-        print(
-            f"step {step}: return {frame['return_mean'].mean():.1f}, distance {frame['distance_mean'].mean():.0f} m "
-            f"over {len(frame)} weathers, {self.seconds / 60:.1f} min",
-            flush=True,
-        )
+    def _info(self) -> dict[str, Any]:
+        seconds = self.seconds + time.monotonic() - self._started
+        return {"seconds": seconds, "settings": self._settings()}
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -1,4 +1,4 @@
-"""A training that dies wherever it is told to, in a process of its own; for ``test_checkpoint_killed``."""
+"""Training that dies at a given moment, in a process of its own; for ``test_checkpoint_killed``."""
 
 import io
 import json
@@ -15,8 +15,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
-from sb3_have.checkpoint import archive
-from sb3_have.checkpoint.checkpoint import ResumableCheckpointCallback, checkpoints, load_checkpoint
+from sb3_have.checkpoint import ResumableCheckpointCallback, archive, checkpoints, load_checkpoint
 
 STEPS, SAVE_FREQ = 240, 10
 MINUTES = 10
@@ -41,7 +40,7 @@ class Mortal(Drifting):
 class MortalFile(io.FileIO):
     """Kills the process in the middle of writing.
 
-    :param n_bytes: that are still written
+    :param n_bytes: Number of bytes that are still written
     """
 
     def __init__(self, path: Path, n_bytes: int):
@@ -56,12 +55,12 @@ class MortalFile(io.FileIO):
 
 
 def prepare(moment: str, number: int) -> None:
-    """Let the process die while it writes its ``number``-th checkpoint, or at its ``number``-th byte."""
+    """Make the process die while it writes its ``number``-th checkpoint, or at its ``number``-th byte."""
     original, calls = os.replace, 0
 
     def replace(source: Path, target: Path) -> None:
         nonlocal calls
-        calls += Path(target).name.startswith("checkpoint-")  # others' caches are renamed too
+        calls += Path(target).name.startswith("checkpoint-")  # not another library's cache
         if calls == number and moment == "before renaming":
             kill()
         original(source, target)
@@ -81,10 +80,10 @@ def make_env() -> VecEnv:
 def train(folder: Path, moment: str = "never", number: int = 0, keep: int = 2) -> SAC:
     """Train to the end, from the newest checkpoint if there is one.
 
-    :param folder: of the checkpoints
-    :param moment: "step", "byte", "before renaming" or "after renaming", when it dies
-    :param number: of the step, byte or checkpoint, from here
-    :param keep: how many checkpoints stay
+    :param folder: Folder of the checkpoints
+    :param moment: When it dies: "step", "byte", "before renaming", "after renaming" or "never"
+    :param number: Number of the step, byte or checkpoint, counted from here
+    :param keep: Number of checkpoints to keep
     """
     prepare(moment, number)
     callback = ResumableCheckpointCallback(folder, SAVE_FREQ, keep)
@@ -102,7 +101,7 @@ def train(folder: Path, moment: str = "never", number: int = 0, keep: int = 2) -
 
 
 def serve() -> None:
-    """Train in a fork of this process for every line of orders, and tell the signal that ended it."""
+    """Train in a fork of this process for every line of input, and print the signal that ended it."""
     signal.alarm(60 * MINUTES)  # not to outlive the test that started this
     th.set_num_threads(1)
     for line in sys.stdin:

@@ -1,4 +1,4 @@
-"""Trainings that are stopped and resumed, and all that must be the same afterwards."""
+"""Training that is stopped and resumed, and everything that must be the same afterwards."""
 
 from __future__ import annotations
 
@@ -17,11 +17,12 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_have import ModalityReplayBuffer
-from sb3_have.checkpoint.checkpoint import ResumableCheckpointCallback, checkpoints, load_checkpoint, random_states
+from sb3_have.checkpoint import ResumableCheckpointCallback, checkpoints, load_checkpoint
+from sb3_have.checkpoint.random_state import random_states
 
 
 def leaves(value: Any, path: str = "") -> dict[str, np.ndarray]:
-    """All arrays and numbers in nested containers, by their path."""
+    """Return all arrays and numbers in nested containers by their path."""
     if isinstance(value, dict):
         return {name: leaf for key, each in value.items() for name, leaf in leaves(each, f"{path}/{key}").items()}
     if isinstance(value, list | tuple | deque):
@@ -30,7 +31,7 @@ def leaves(value: Any, path: str = "") -> dict[str, np.ndarray]:
 
 
 def everything(model: Any) -> dict[str, np.ndarray]:
-    """Weights, optimizers, counters, replay content, normalisation, episodes and random numbers."""
+    """Return weights, optimizers, counters, replay content, normalisation, episodes and random numbers."""
     env, buffer = model.get_env(), model.replay_buffer
     content = {name: value for name, value in vars(buffer).items() if isinstance(value, np.ndarray | dict | int)}
     if isinstance(buffer, ModalityReplayBuffer):
@@ -45,7 +46,7 @@ def everything(model: Any) -> dict[str, np.ndarray]:
             "counters": {name: getattr(model, name) for name in counters},
             "replay": {name: value for name, value in content.items() if name != "dtypes"},
             "last_obs": [model._last_obs, model._last_original_obs],
-            "episodes": [(told["r"], told["l"]) for told in model.ep_info_buffer],
+            "episodes": [(info["r"], info["l"]) for info in model.ep_info_buffer],
             "normalize": vars(normalizer.obs_rms) if normalizer is not None else {},
             "returns": [normalizer.returns, vars(normalizer.ret_rms)] if normalizer is not None else [],
             "running": env.get_attr("rewards"),  # Monitor's, of the episode that is not over
@@ -68,9 +69,9 @@ def assert_resumes(
     steps: int,
     make_callback: Callable[[], list[BaseCallback]] = list,
 ) -> OffPolicyAlgorithm:
-    """A training to ``steps``, and one that goes on from the first one's checkpoint at ``stop``, end the same.
+    """Assert that training to ``steps`` ends the same if it is resumed from a checkpoint at ``stop``.
 
-    :return: the second one's model
+    :return: Model of the resumed training
     """
 
     def callbacks() -> list[BaseCallback]:
@@ -87,7 +88,7 @@ def assert_resumes(
     checkpoint, *later = checkpoints(folder)
     for path in later:
         path.unlink()
-    np.random.rand(7), th.rand(7)  # another process
+    np.random.rand(7), th.rand(7)  # as another process may
     going_on = callbacks()
     second: OffPolicyAlgorithm = load_checkpoint(checkpoint, make_env(), going_on, device="cpu")
     done = second.num_timesteps
@@ -99,9 +100,9 @@ def assert_resumes(
 
 
 class Drifting(gym.Env[np.ndarray, np.ndarray]):
-    """A point that drifts; at ``reset`` and on the way it draws from every source that an environment may draw from.
+    """A point that drifts, and draws from every source of random numbers that an environment may draw from.
 
-    :param length: of an episode [steps]
+    :param length: Steps of an episode
     """
 
     def __init__(self, length: int = 9):

@@ -1,4 +1,4 @@
-"""A wrapper that gives others the time to interfere with a run."""
+"""A wrapper that gives a test time to interfere with a run."""
 
 import os
 import time
@@ -9,7 +9,7 @@ import gymnasium as gym
 
 
 class SlowUntil(gym.Wrapper[Any, Any, Any, Any]):
-    """Takes its time for every step until the file named in the environment variable ``HURRY`` is there."""
+    """Slows every step down until the file named in the environment variable ``HURRY`` exists."""
 
     def step(self, action: Any) -> Any:
         if not Path(os.environ["HURRY"]).exists():

@@ -21,8 +21,9 @@ from sb3_have.benchmark.reading import read_results
 from sb3_have.benchmark.results import is_finished
 from sb3_have.benchmark.runner import FINISHED, STOPPED, Runner
 from sb3_have.benchmark.stages import run_job
+from sb3_have.checkpoint import checkpoint_step, newest_checkpoint
 from sb3_have.evaluation.evaluation import evaluate_episodes
-from sb3_have.train import algorithms, checkpoint_step, newest_checkpoint
+from sb3_have.train import algorithms
 
 
 def wait_until(happened: Callable[[], bool], process: subprocess.Popen[bytes], seconds: float = 240.0) -> None:

@@ -4,14 +4,13 @@ import os
 import signal
 import sys
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 from tiny_grid import FAILURES, LocalPool, contents, make_grid, read
 
-from sb3_have import HAVESAC
+from sb3_have import HAVESAC, train
 from sb3_have.benchmark import runner as runner_module
 from sb3_have.benchmark.__main__ import main
 from sb3_have.benchmark.grid import Job
@@ -19,7 +18,8 @@ from sb3_have.benchmark.reading import read_results
 from sb3_have.benchmark.results import merge
 from sb3_have.benchmark.runner import FAILED, FINISHED, STOPPED, Runner
 from sb3_have.benchmark.stages import collect, run_job
-from sb3_have.train import Run, algorithms
+from sb3_have.checkpoint import StopTrainingOnSignal
+from sb3_have.train import algorithms
 
 
 @pytest.fixture
@@ -112,21 +112,20 @@ def test_work_goes_seed_by_seed_on_all_workers(tmp_path: Path, unexamined: None)
     assert pool.started == [job.name for job in jobs] and pool.most == 3
 
 
-def test_run_that_dies_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_that_dies_resumes_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     grid, runs, results = make_grid(tmp_path, seeds=[0]), tmp_path / "runs", tmp_path / "results"
-    began: list[tuple[str, int]] = []
-    learn = Run._learn
+    deaths: list[int] = []
 
-    def learn_and_die_once(run: Run, model: Any, steps: int) -> None:
-        began.append((run.out.name, model.num_timesteps))
-        if len(began) == 1:
-            learn(run, model, 25)  # a checkpoint at 20
-            raise MemoryError("killed")
-        learn(run, model, steps)
+    class Dies(StopTrainingOnSignal):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == 25 and not deaths:
+                deaths.append(25)
+                raise MemoryError("killed")
+            return super()._on_step()
 
-    monkeypatch.setattr(Run, "_learn", learn_and_die_once)
+    monkeypatch.setattr(train, "StopTrainingOnSignal", Dies)
     assert Runner(grid.jobs(), runs, results).run(LocalPool(lambda job: run_job(job, runs))) == FINISHED
-    assert began == [("gve-0", 0), ("gve-0", 20), ("have-0", 0)]
+    assert deaths and {path.name for path in (runs / "gve-0").glob("log-*")} == {"log-0", "log-20"}
     curve = read(results, "evaluations").query("method == 'gve'")
     assert list(curve["step"]) == [10, 10, 20, 20, 30, 30], "no evaluation is there twice"
     assert not (runs / "gve-0" / "traceback.txt").exists()

@@ -14,14 +14,17 @@ import pytest
 from fake_drive import ENV_ID
 from tiny_grid import FAILURES, TINY, make_grid, read
 
-from sb3_have import HAVESAC, train
+from sb3_have import HAVESAC
 from sb3_have.benchmark import stages
 from sb3_have.benchmark.grid import FINAL_SEED, Job
 from sb3_have.benchmark.results import is_finished, merge
 from sb3_have.benchmark.stages import collect, run_job
+from sb3_have.checkpoint import newest_checkpoint
+from sb3_have.evaluation import callback
+from sb3_have.evaluation.callback import EVALUATION_SEED
 from sb3_have.evaluation.episodes import Task
 from sb3_have.evaluation.evaluation import episode_tasks
-from sb3_have.train import EVALUATION_SEED, Run, newest_checkpoint
+from sb3_have.train import Run
 
 
 def test_evaluation_seeds_are_not_those_of_training() -> None:
@@ -123,7 +126,7 @@ def test_checkpoint_stays_only_if_asked_for(tmp_path: Path) -> None:
     assert {path.name for path in folder.glob("log-*")} == {"log-0", "log-30"}
     with pytest.raises(ValueError, match="gone on to step 40 from step 30"):
         run_job(short, tmp_path)
-    with pytest.raises(ValueError, match="no checkpoint to go on from"):
+    with pytest.raises(ValueError, match="no checkpoint to resume from"):
         run_job(make_grid(tmp_path, steps=50).jobs()[0], tmp_path)
 
 
@@ -149,19 +152,16 @@ def test_training_that_ends_a_rollout_late_is_driven(tmp_path: Path) -> None:
 def test_stop_in_the_last_evaluation_is_a_stop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     job = make_grid(tmp_path, eval_freq=30).jobs()[0]
     with monkeypatch.context() as patch:
-        patch.setattr(train, "evaluate", lambda *args, **kwargs: os.kill(os.getpid(), signal.SIGINT))
+        patch.setattr(callback, "evaluate", lambda *args, **kwargs: os.kill(os.getpid(), signal.SIGINT))
         assert not run_job(job, tmp_path)
     assert newest_checkpoint(tmp_path / job.name) == tmp_path / job.name / "checkpoint-30"
     assert run_job(job, tmp_path)
 
 
-def test_remains_of_a_checkpoint_are_in_nobodys_way(tmp_path: Path) -> None:
-    """As when a run was killed while it dropped one of two."""
+def test_unfinished_checkpoint_is_removed(tmp_path: Path) -> None:
     job = make_grid(tmp_path).jobs()[0]
-    remains = tmp_path / job.name / "checkpoint.partial"
     assert run_job(job, tmp_path, keep_checkpoint=True)
-    remains.mkdir()
-    (remains / "model.zip").touch()
+    (tmp_path / job.name / "checkpoint-40.partial").touch()
     assert run_job(job, tmp_path)
     assert not [*(tmp_path / job.name).glob("checkpoint*")]
 

@@ -1,4 +1,4 @@
-"""Trainings that go on from a checkpoint end with the bits of those that never stopped."""
+"""Training that resumes from a checkpoint ends with the same bits as training that never stopped."""
 
 import multiprocessing
 from functools import partial
@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from envs import TINY, RandomSensors, vectors_space
-from gymnasium.wrappers import TimeLimit, TransformReward
+from gymnasium.wrappers import TransformReward
 from resuming import Drifting, assert_resumes, assert_same, everything
 from sb3_contrib import TQC
 from stable_baselines3 import SAC, TD3, HerReplayBuffer
@@ -20,8 +20,15 @@ from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize
 
 from sb3_have import HAVESAC, DeepMDPCallback
-from sb3_have.checkpoint.checkpoint import ResumableCheckpointCallback, checkpoints, load_checkpoint, save_checkpoint
-from sb3_have.checkpoint.env_state import ResumableEnv, environments_state, restore_environments
+from sb3_have.checkpoint import (
+    ResumableCheckpointCallback,
+    ResumableEnv,
+    checkpoints,
+    load_checkpoint,
+    save_checkpoint,
+)
+from sb3_have.checkpoint.env_state import environments_state, restore_environments
+from sb3_have.checkpoint.stopping import TrainingStopped, stop_training
 from sb3_have.common.crossq import MultiInputCrossQ
 
 
@@ -45,7 +52,7 @@ def normalized(n_envs: int = 1) -> VecEnv:
 
 
 def pendulum() -> gym.Env[Any, Any]:
-    """Stock, with a function in a wrapper."""
+    """An environment of Gymnasium with a lambda in a wrapper."""
     return TransformReward(gym.make("Pendulum-v1", max_episode_steps=31), lambda reward: 0.1 * float(reward))
 
 
@@ -118,7 +125,7 @@ def test_schedules_go_on(tmp_path: Path) -> None:
 
 @pytest.fixture
 def warm_workers() -> None:
-    """Worker processes import what they need once for all."""
+    """Import once what all worker processes need."""
     multiprocessing.get_context("forkserver").set_forkserver_preload(["resuming", "sb3_have.checkpoint.env_state"])
 
 
@@ -131,21 +138,8 @@ def test_worker_processes(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("warm_workers")
-def test_worker_processes_out_of_reach(tmp_path: Path) -> None:
-    """Without ResumableEnv the episodes begin anew, from the same random numbers."""
-    model = sac(SubprocVecEnv([Drifting] * 2)).learn(12)
-    with pytest.warns(UserWarning, match=r"SubprocVecEnv whose outermost wrapper is not .*ResumableEnv\..* begin anew"):
-        save_checkpoint(model, tmp_path / "mine")
-    resumed = load_checkpoint(tmp_path / "mine", SubprocVecEnv([Drifting] * 2), device="cpu")
-    assert resumed._last_obs is None
-    assert np.array_equal(resumed.env.reset(), model.env.reset())
-    for one in (model, resumed):
-        one.env.close()
-
-
-@pytest.mark.usefixtures("warm_workers")
-def test_worker_processes_that_are_others() -> None:
-    """Refused where the user sees it, and not in a worker, which would die of it."""
+def test_worker_processes_of_other_environments(tmp_path: Path) -> None:
+    """They are refused without ending the workers."""
 
     def workers(*wrappers: Any) -> SubprocVecEnv:
         def make() -> gym.Env[Any, Any]:
@@ -157,36 +151,27 @@ def test_worker_processes_that_are_others() -> None:
         return SubprocVecEnv([make])
 
     inner, whole, bare = workers(ResumableEnv, Monitor), workers(Monitor, ResumableEnv), workers(ResumableEnv)
-    shorter, longer = (workers(partial(TimeLimit, max_episode_steps=steps), ResumableEnv) for steps in (5, 6))
-    assert len(environments_state(inner).lost) == 1, "Monitor's state would be missing"
     state = environments_state(whole)
     assert state.lost == []
-    with pytest.raises(ValueError, match="outermost wrapper is not"):
+    with pytest.raises(ValueError, match="has to be the outermost wrapper"):
         restore_environments(inner, state)
     with pytest.raises(ValueError, match="ResumableEnv > Monitor > Drifting, and it was given ResumableEnv > Drifting"):
         restore_environments(bare, state)
-    shorter.reset()
-    with pytest.raises(ValueError, match=r"max_episode_steps: 5, .* max_episode_steps: 6"):
-        restore_environments(longer, environments_state(shorter))
-    for env in (inner, whole, bare, shorter, longer):
-        env.reset()
+    bare.reset()
+
+    # Without access to the workers new episodes begin
+    model = sac(inner).learn(12)
+    with pytest.warns(UserWarning, match=r"SubprocVecEnv, which need ResumableEnv as the outermost .*new episodes"):
+        save_checkpoint(model, tmp_path / "mine")
+    resumed = load_checkpoint(tmp_path / "mine", inner, device="cpu")
+    assert resumed._last_obs is None
+    assert resumed.learn(1, reset_num_timesteps=False).num_timesteps == 13
+    for env in (inner, whole, bare):
         env.close()
 
 
-def test_noise_of_a_training_that_has_not_begun(tmp_path: Path) -> None:
-    """`learn` makes the noise one for several environments, which resets it; nothing of it may be skipped."""
-    env = drifting(2)
-    model = sac(env, TD3, action_noise=noise(2))
-    for each in env.unwrapped.envs:  # type: ignore[attr-defined]
-        each.action_space.seed(1)  # which draws from the system's entropy otherwise, when first asked
-    save_checkpoint(model, tmp_path / "mine")
-    expected = everything(model.learn(20))
-    again = load_checkpoint(tmp_path / "mine", drifting(2), device="cpu")
-    assert_same(everything(again.learn(20)), expected)
-
-
 def test_training_that_a_callback_ends(tmp_path: Path) -> None:
-    """Its last transition is nowhere, so there is no checkpoint of that step."""
+    """Its last transition is not stored, so there is no checkpoint of that step."""
 
     class Ends(BaseCallback):
         def _on_step(self) -> bool:
@@ -204,6 +189,46 @@ def test_saving_does_not_disturb(tmp_path: Path) -> None:
     assert_same(everything(saving), without)
 
 
+@pytest.mark.parametrize("freq", [10, 100], ids=["where one is due", "where none is due"])
+def test_training_stopped_between_rollouts(tmp_path: Path, freq: int) -> None:
+    """As by StopTrainingOnSignal; gSDE's noise of the next rollout has been drawn by then."""
+
+    class Stops(BaseCallback):
+        def _on_rollout_start(self) -> None:
+            if self.model.num_timesteps == 30:
+                stop_training(self)
+
+        def _on_step(self) -> bool:
+            return True
+
+    expected = everything(sac(drifting(), use_sde=True, action_noise=noise(2)).learn(45))
+    callback = ResumableCheckpointCallback(tmp_path, freq)
+    with pytest.raises(TrainingStopped):
+        sac(drifting(), use_sde=True, action_noise=noise(2)).learn(45, [callback, Stops()])
+    assert checkpoints(tmp_path)[-1].name == "checkpoint-30"
+    resumed = load_checkpoint(tmp_path, drifting(), callback, device="cpu")
+    assert_same(everything(resumed.learn(15, callback, reset_num_timesteps=False)), expected)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "n_envs"), [({"algorithm": TD3}, 1), ({"algorithm": TD3}, 2), ({"use_sde": True}, 1)]
+)
+def test_noise_after_the_end_of_training(tmp_path: Path, kwargs: dict[str, Any], n_envs: int) -> None:
+    """The checkpoint at the end continues the action noise, which `learn` would reset, but not gSDE's."""
+
+    def make_model() -> Any:
+        model = sac(drifting(n_envs), action_noise=noise(2), **kwargs)
+        for env in model.get_env().unwrapped.envs:
+            env.action_space.seed(1)
+        return model
+
+    expected = everything(make_model().learn(40))
+    callback = ResumableCheckpointCallback(tmp_path, 0)
+    make_model().learn(20, callback)
+    resumed = load_checkpoint(tmp_path, drifting(n_envs), callback, device="cpu")
+    assert_same(everything(resumed.learn(20, callback, reset_num_timesteps=False)), expected)
+
+
 def test_between_two_calls_of_learn(tmp_path: Path) -> None:
     model = sac(normalized(), use_sde=True)
     model.learn(20)
@@ -215,17 +240,17 @@ def test_between_two_calls_of_learn(tmp_path: Path) -> None:
 
 
 def test_loaded_model_can_be_saved_at_once(tmp_path: Path) -> None:
-    make_model = partial(sac, use_sde=True, action_noise=noise(2))
-    first = make_model(drifting())
-    first.learn(40, ResumableCheckpointCallback(tmp_path, 23))
-    again = load_checkpoint(tmp_path / "checkpoint-23", drifting(), device="cpu")
-    save_checkpoint(again, tmp_path / "copy")
-    second = load_checkpoint(tmp_path / "copy", drifting(), device="cpu")
-    second.learn(17, reset_num_timesteps=False)
+    first, callback = sac(drifting(), use_sde=True, action_noise=noise(2)), ResumableCheckpointCallback(tmp_path, 23)
+    first.learn(40, callback)
+    again = load_checkpoint(tmp_path / "checkpoint-23", drifting(), callback, device="cpu")
+    save_checkpoint(again, tmp_path / "new" / "folder" / "copy", callback)
+    callback = ResumableCheckpointCallback(tmp_path / "new", 23)
+    second = load_checkpoint(tmp_path / "new" / "folder" / "copy", drifting(), callback, device="cpu")
+    second.learn(17, callback, reset_num_timesteps=False)
     assert_same(everything(second), everything(first))
 
 
-def test_monitor_goes_on_with_its_file(tmp_path: Path) -> None:
+def test_monitor_continues_its_file(tmp_path: Path) -> None:
     def make_env(override: bool) -> VecEnv:
         return DummyVecEnv([lambda: Monitor(Drifting(), str(tmp_path / "monitor.csv"), override_existing=override)])
 

@@ -1,4 +1,4 @@
-"""Files of checkpoints: whole or not there, damaged ones refused by name, full disks survived."""
+"""Files of checkpoints: complete or absent, damaged ones refused, full disks survived."""
 
 import errno
 import os
@@ -19,14 +19,15 @@ from stable_baselines3.common.callbacks import EveryNTimesteps
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from sb3_have.checkpoint.archive import DamagedCheckpointError, check_archive, dumps, loads, read_archive, write_archive
-from sb3_have.checkpoint.checkpoint import (
+from sb3_have.checkpoint import (
+    DamagedCheckpointError,
     ResumableCheckpointCallback,
     checkpoint_info,
     load_checkpoint,
     newest_checkpoint,
     save_checkpoint,
 )
+from sb3_have.checkpoint.archive import damage, dumps, loads, read_archive, write_archive
 
 
 def make_env() -> DummyVecEnv:
@@ -65,7 +66,7 @@ def test_info_is_read_without_the_rest(tmp_path: Path) -> None:
 
 
 def test_damage_is_refused_by_name(tmp_path: Path) -> None:
-    """Cut off anywhere, or one byte another: nothing is unpickled, and the checkpoint before is taken."""
+    """Truncated or with a flipped bit: nothing is unpickled, and the previous checkpoint is loaded."""
     callback = ResumableCheckpointCallback(tmp_path, 10)
     make_model().learn(20, callback)
     newest = tmp_path / "checkpoint-20"
@@ -75,18 +76,16 @@ def test_damage_is_refused_by_name(tmp_path: Path) -> None:
         broken = bytearray(whole)
         broken[position] ^= 1 << rng.integers(8)
         newest.write_bytes(bytes(broken) if i % 2 else whole[:position])
-        try:
-            check_archive(newest)
-        except DamagedCheckpointError as error:
-            assert re.search(r"checkpoint-20 is damaged .*\(.*\); go on from another", str(error))
+        if error := damage(newest):
+            assert re.search(r"checkpoint-20 is damaged .*\(.*\); use another", str(error))
             n_refused += 1
-        else:  # a bit of the zip format that is there twice, or of no use
+        else:  # a redundant or unused bit of the zip format
             assert contents(newest) == intact
         if i < 6:
             with pytest.raises(DamagedCheckpointError, match="checkpoint-20 is damaged"):
                 load_checkpoint(newest, make_env())
     assert n_refused >= 27
-    with pytest.warns(UserWarning, match="checkpoint-20 is damaged.*the one before it is taken"):
+    with pytest.warns(UserWarning, match="checkpoint-20 is damaged.*Skipping to the previous"):
         assert newest_checkpoint(tmp_path) == tmp_path / "checkpoint-10"
     with pytest.warns(UserWarning, match="checkpoint-20 is damaged"):
         model = load_checkpoint(tmp_path, make_env(), device="cpu")
@@ -95,8 +94,8 @@ def test_damage_is_refused_by_name(tmp_path: Path) -> None:
     assert newest_checkpoint(tmp_path) == newest
 
 
-def test_damage_of_what_has_no_checksum(tmp_path: Path) -> None:
-    """Names, lengths and methods of the directory at the end, each bit of it."""
+def test_damaged_directory(tmp_path: Path) -> None:
+    """Its names, sizes and methods have no checksum."""
     file, state = tmp_path / "file", {"frames": np.arange(1 << 20, dtype=np.uint8), "small": 1}
     write_archive(file, {"steps": 1}, memoryview(b"model"), state)
     whole = file.read_bytes()
@@ -126,14 +125,11 @@ def test_what_is_no_checkpoint(tmp_path: Path) -> None:
     make_model().save(tmp_path / "model.zip")
     with pytest.raises(DamagedCheckpointError, match=r"model\.zip is damaged"):
         load_checkpoint(tmp_path / "model.zip", make_env())
-    (tmp_path / "replay_buffer.pkl").touch()
-    with pytest.raises(ValueError, match="of an older form"):
-        load_checkpoint(tmp_path, make_env())
 
 
 @pytest.mark.parametrize("where", ["write", "fsync", "replace"])
 def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str) -> None:
-    """A warning; the training ends as it would have, what was there is still there, and nothing is left half."""
+    """A warning is issued and training continues; previous checkpoints are kept, and nothing is left half-written."""
     expected = everything(make_model().learn(30))
 
     class DiskThatFills(ResumableCheckpointCallback):
@@ -157,15 +153,15 @@ def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str) 
     assert_same(everything(resumed), expected)
 
 
-def test_remains_that_cannot_be_removed(tmp_path: Path) -> None:
-    """In a folder that is read-only by now, say; here they are a folder."""
+def test_unfinished_file_that_cannot_be_removed(tmp_path: Path) -> None:
+    """As in a folder that has become read-only; here it is a folder."""
     (tmp_path / "checkpoint-3.partial").mkdir()
-    with pytest.warns(UserWarning, match=r"checkpoint-9 could not be written \(.*; the training goes on without it"):
+    with pytest.warns(UserWarning, match=r"checkpoint-9 could not be written \(.*; training continues without it"):
         assert make_model().learn(9, ResumableCheckpointCallback(tmp_path, 100)).num_timesteps == 9
 
 
 def test_folder_that_cannot_be_synced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As on some network file systems; the checkpoint is there, and older ones make room."""
+    """As on some network file systems; the checkpoint is written nevertheless."""
 
     def fsync(handle: int, original: Any = os.fsync) -> None:
         if os.path.isdir(f"/proc/self/fd/{handle}"):
@@ -179,13 +175,11 @@ def test_folder_that_cannot_be_synced(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_callback_within_another_is_refused(tmp_path: Path) -> None:
     every = EveryNTimesteps(5, ResumableCheckpointCallback(tmp_path, 5))
-    with pytest.raises(ValueError, match="within EveryNTimesteps never saves"):
+    with pytest.raises(ValueError, match="within EveryNTimesteps would never save"):
         make_model().learn(9, every)
 
 
-def test_disk_that_is_full_at_once_is_an_error_without_callback(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_full_disk_is_an_error_without_callback(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "fsync", full_disk)
     with pytest.raises(OSError, match="No space left"):
         save_checkpoint(make_model(), tmp_path / "mine")
@@ -208,8 +202,8 @@ def test_file_and_folder_are_synced_before_and_after_renaming(tmp_path: Path, mo
     assert done == ["file", "renamed", "folder"]
 
 
-def test_large_arrays_take_no_memory_twice(tmp_path: Path) -> None:
-    """On the way out hardly any, on the way in once."""
+def test_large_arrays_are_not_copied(tmp_path: Path) -> None:
+    """Saving takes hardly any memory, loading that of the arrays."""
     rng, file = np.random.default_rng(0), tmp_path / "file"
     frames, fortran = rng.integers(0, 256, (8, 1 << 20), np.uint8), np.asfortranarray(rng.random((512, 999)))
     state = {"frames": frames, "fortran": fortran}
@@ -228,11 +222,11 @@ def test_large_arrays_take_no_memory_twice(tmp_path: Path) -> None:
 
 
 class Known:
-    """Stands for a class that a script defines."""
+    """Stands in for a class that a script defines."""
 
 
-def test_classes_of_the_script_are_its_own_when_it_runs_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As with pickle; cloudpickle would bring a copy of the class, for which isinstance fails."""
+def test_classes_of_the_running_script(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are pickled by name; isinstance fails for the copies that cloudpickle makes."""
     main = sys.modules["__main__"]
     again = type("Known", (), {"__module__": "__main__"})
     monkeypatch.setattr(Known, "__module__", "__main__")

@@ -1,4 +1,4 @@
-"""A training killed again and again loses nothing but the steps since its last checkpoint."""
+"""Training that is killed repeatedly loses nothing but the steps since its last checkpoint."""
 
 import json
 import os
@@ -13,14 +13,14 @@ import pytest
 from killed_training import SAVE_FREQ, STEPS
 from resuming import assert_same, everything
 
-from sb3_have.checkpoint.archive import check_archive
-from sb3_have.checkpoint.checkpoint import checkpoint_step, checkpoints
+from sb3_have.checkpoint import checkpoint_step, checkpoints
+from sb3_have.checkpoint.archive import damage
 
 N_KILLS = 20
 
 
 def moments(rng: np.random.Generator) -> list[tuple[str, float, int]]:
-    """How to die, at which number, or which part of the file, and how many checkpoints will have been written."""
+    """Draw how to die, at which number or part of the file, and count the checkpoints written by then."""
     found: list[tuple[str, float, int]] = []
     for i in range(N_KILLS):
         if i % 2 == 0:
@@ -54,11 +54,11 @@ def test_killed_again_and_again(tmp_path: Path) -> None:
             done += written * SAVE_FREQ
             assert max(map(checkpoint_step, checkpoints(folder)), default=0) == done < STEPS, moment
             for path in checkpoints(folder):
-                check_archive(path)
+                assert damage(path) is None
             if moment == "byte":
                 assert len([*folder.glob("*.partial")]) == 1
     assert min(parts_written) < 0.1 and max(parts_written) > 0.9
     assert done > STEPS // 2, "the deaths were at the beginning only"
 
     assert_same(everything(killed_training.train(folder)), expected)
-    assert len([*folder.glob("checkpoint-*")]) == 2, "remains of the dead"
+    assert len([*folder.glob("checkpoint-*")]) == 2, "unfinished files are left"

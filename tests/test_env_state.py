@@ -1,4 +1,4 @@
-"""The state of environments: complete where it can be pickled, told by name where it cannot."""
+"""The state of environments, complete or with a warning, and that of callbacks."""
 
 import random
 import threading
@@ -19,13 +19,14 @@ from stable_baselines3.common.callbacks import (
     CallbackList,
     EvalCallback,
     EveryNTimesteps,
+    StopTrainingOnMaxEpisodes,
     StopTrainingOnNoModelImprovement,
 )
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
-from sb3_have.checkpoint.checkpoint import load_checkpoint, save_checkpoint
-from sb3_have.checkpoint.env_state import ResumableEnv, environments_state, restore_environments
+from sb3_have.checkpoint import ResumableEnv, load_checkpoint, save_checkpoint
+from sb3_have.checkpoint.env_state import environments_state, restore_environments
 
 
 class Connected(Drifting):
@@ -105,7 +106,7 @@ def test_parts_that_are_shared_stay_shared() -> None:
     assert restored.rng.random() == envs[0].envs[0].rng.random()  # type: ignore[attr-defined]
 
 
-def test_functions_and_drawing_are_in_nobodys_way() -> None:
+def test_functions_and_drawing() -> None:
     def make() -> gym.Env[Any, Any]:
         return TransformReward(gym.make("Pendulum-v1", render_mode="rgb_array"), lambda reward: 2 * float(reward))
 
@@ -122,15 +123,15 @@ def test_functions_and_drawing_are_in_nobodys_way() -> None:
     assert np.array_equal(second.render(), first.render())  # type: ignore[arg-type]
 
 
-def test_any_name_is_an_environments_own() -> None:
-    """What SubprocVecEnv calls its workers may be something else in an environment."""
+def test_attribute_with_the_name_of_one_of_subproc_vec_env() -> None:
+    """It belongs to the state of an environment."""
     first, second = DummyVecEnv([Drifting]), DummyVecEnv([Drifting])
     first.envs[0].processes = ["milling"]  # type: ignore[attr-defined]
     restore_environments(second, environments_state(first))
     assert second.envs[0].processes == ["milling"]  # type: ignore[attr-defined]
 
 
-def test_what_the_old_state_has_computed_is_forgotten() -> None:
+def test_attributes_computed_from_the_old_state_are_forgotten() -> None:
     first, second = make_vec_env(), make_vec_env()
     second.reset()
     second.unwrapped.envs[0].unwrapped.cached = "of another episode"  # type: ignore[attr-defined]
@@ -139,8 +140,8 @@ def test_what_the_old_state_has_computed_is_forgotten() -> None:
     assert not hasattr(second.unwrapped.envs[0].unwrapped, "cached")  # type: ignore[attr-defined]
 
 
-def test_settings_stay_where_there_is_no_state() -> None:
-    """A simulator may be on another port by now."""
+def test_settings_of_an_environment_that_cannot_be_pickled() -> None:
+    """They stay as they are: a simulator may have another port now."""
     first, second = (DummyVecEnv([partial(TimeLimit, Connected(), steps)]) for steps in (5, 7))
     first.reset()
     state = environments_state(first)
@@ -165,11 +166,11 @@ def sac(env: VecEnv) -> SAC:
     return SAC("MlpPolicy", env, policy_kwargs={"net_arch": [8]}, **kwargs)
 
 
-def test_environment_that_cannot_be_pickled_begins_anew(tmp_path: Path) -> None:
-    """Told by class and attribute; its random numbers go on, and all else does."""
+def test_environment_that_cannot_be_pickled(tmp_path: Path) -> None:
+    """A warning names class and attribute; everything but the episode is restored."""
     model = sac(make_vec_env(Connected)).learn(20)
-    told = r"Connected\.connection \(TypeError: .*\); Connected\.road \(TypeError: .*\)\..* its episodes begin anew"
-    with pytest.warns(UserWarning, match=told):
+    warning = r"Connected\.connection \(TypeError: .*\); Connected\.road \(TypeError: .*\)\..* begins new episodes"
+    with pytest.warns(UserWarning, match=warning):
         save_checkpoint(model, tmp_path / "mine")
     resumed = load_checkpoint(tmp_path / "mine", make_vec_env(Connected), device="cpu")
     states = [everything(one) for one in (model, resumed)]
@@ -181,22 +182,6 @@ def test_environment_that_cannot_be_pickled_begins_anew(tmp_path: Path) -> None:
     model.env.reset()  # type: ignore[union-attr]
     first = model._vec_normalize_env.get_original_obs()  # type: ignore[union-attr]
     assert_same(leaves(resumed.replay_buffer.observations[20]), leaves(first))
-
-
-class Counting(BaseCallback):
-    """State of many kinds, and a constructor's parameter."""
-
-    def __init__(self, factor: float):
-        super().__init__()
-        self.factor, self.rng = factor, np.random.default_rng(0)
-        self.seen: deque[Any] = deque(maxlen=3)
-        self.table = {"rows": [np.zeros(2)]}
-        self.function = lambda: 0
-
-    def _on_step(self) -> bool:
-        self.seen.append(self.factor * self.rng.random())
-        self.table["rows"].append(np.full(2, self.n_calls))
-        return True
 
 
 class Own(BaseCallback):
@@ -218,63 +203,37 @@ class Own(BaseCallback):
         self.count = state
 
 
-def test_state_of_callbacks(tmp_path: Path) -> None:
-    def callbacks(factor: float) -> list[BaseCallback]:
-        stop = StopTrainingOnNoModelImprovement(100)
-        evaluation = EvalCallback(make_vec_env(), callback_after_eval=stop, eval_freq=4, n_eval_episodes=1, verbose=0)
-        return [Counting(factor), evaluation, Counting(2 * factor), Own()]
-
-    first = callbacks(1.0)
-    model = sac(make_vec_env()).learn(10, CallbackList(first))
-    save_checkpoint(model, tmp_path / "mine", CallbackList(first))
-    later = [*callbacks(5.0)[::-1], Newcomer()]
-    load_checkpoint(tmp_path / "mine", make_vec_env(), later, device="cpu")
-    own, second_count, evaluation, first_count, _ = later
-    assert own.count == 10  # type: ignore[attr-defined]
-    # in the order of their class
-    for restored, saved, factor in [(second_count, first[0], 10.0), (first_count, first[2], 5.0)]:
-        assert isinstance(restored, Counting) and isinstance(saved, Counting)
-        assert restored.factor == factor, "a parameter is the user's"
-        assert restored.n_calls == 10 and restored.seen == saved.seen and restored.seen.maxlen == 3
-        assert_same(leaves(restored.table), leaves(saved.table))
-        assert restored.rng.random() == saved.rng.random()
-    assert isinstance(evaluation, EvalCallback) and isinstance(first[1], EvalCallback)
-    assert evaluation.n_calls == 10 and evaluation.best_mean_reward == first[1].best_mean_reward > -np.inf
-    assert isinstance(evaluation.callback, StopTrainingOnNoModelImprovement)
-    assert evaluation.callback.n_calls == 2 and evaluation.callback.last_best_mean_reward > -np.inf
-
-
-def test_callbacks_stay_where_they_are(tmp_path: Path) -> None:
-    """One that was saved alone may be within another when the training goes on."""
-    model = sac(make_vec_env())
-    save_checkpoint(model, tmp_path / "mine", Counting(1.0))
-    within = EveryNTimesteps(2, Counting(1.0))
-    load_checkpoint(tmp_path / "mine", make_vec_env(), within, device="cpu")
-    assert within.callback is not None and within.callback.parent is within
-
-
-class Stateful(BaseCallback):
+class Stateless(BaseCallback):
     """Has a method that is not the one meant."""
 
-    calls = 0
+    seen = 0
+
+    def _on_step(self) -> bool:
+        self.seen += 1
+        return True
 
     def get_state(self, name: str) -> str:
         return name
 
-    def _on_step(self) -> bool:
-        self.calls += 1
-        return True
 
+def test_state_of_callbacks(tmp_path: Path) -> None:
+    def callbacks() -> list[BaseCallback]:
+        stop = StopTrainingOnNoModelImprovement(100)
+        evaluation = EvalCallback(make_vec_env(), callback_after_eval=stop, eval_freq=4, n_eval_episodes=1, verbose=0)
+        return [Own(), evaluation, EveryNTimesteps(3, Own()), StopTrainingOnMaxEpisodes(99), Stateless()]
 
-def test_method_that_is_only_called_alike(tmp_path: Path) -> None:
-    first, later = Stateful(), Stateful()
-    save_checkpoint(sac(make_vec_env()).learn(3, first), tmp_path / "mine", first)
-    load_checkpoint(tmp_path / "mine", make_vec_env(), later, device="cpu")
-    assert later.calls == 3
-
-
-class Newcomer(BaseCallback):
-    """Was not there when the checkpoint was saved."""
-
-    def _on_step(self) -> bool:
-        return True
+    first, later = callbacks(), callbacks()
+    save_checkpoint(sac(make_vec_env()).learn(10, first), tmp_path / "mine", CallbackList(first))
+    # Another order, and one that was not there
+    load_checkpoint(tmp_path / "mine", make_vec_env(), [CallbackList(later[::-1]), StopTrainingOnMaxEpisodes(9)], "cpu")
+    own, evaluation, every, stop, stateless = later
+    assert isinstance(every, EveryNTimesteps) and every.last_time_trigger == 9
+    # They are matched in the order of their class
+    assert isinstance(own, Own) and isinstance(every.callback, Own)
+    assert (every.callback.count, own.count) == (10, 3) and every.callback.parent is every
+    assert isinstance(evaluation, EvalCallback) and isinstance(first[1], EvalCallback)
+    assert evaluation.n_calls == 10 and evaluation.best_mean_reward == first[1].best_mean_reward > -np.inf
+    assert isinstance(evaluation.callback, StopTrainingOnNoModelImprovement)
+    assert evaluation.callback.n_calls == 2 and evaluation.callback.last_best_mean_reward > -np.inf
+    assert isinstance(stop, StopTrainingOnMaxEpisodes) and stop.n_episodes == 1
+    assert isinstance(stateless, Stateless) and stateless.n_calls == 10 and stateless.seen == 0

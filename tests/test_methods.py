@@ -12,10 +12,11 @@ from stable_baselines3.common.policies import ContinuousCritic
 from torch import nn
 
 from sb3_have import HAVESAC, ModalityReplayBuffer
+from sb3_have.checkpoint import newest_checkpoint
 from sb3_have.common.encoders import MultiModalExtractor
 from sb3_have.configuration import config_path, load_config, model_kwargs
 from sb3_have.evaluation.recording import record_episode
-from sb3_have.train import Run, algorithm_of, algorithms, make_training_env, newest_checkpoint
+from sb3_have.train import Run, algorithm_of, algorithms, make_training_env
 
 ENV_ID = "HighwayVision-v0"
 SENSORS = ["rgb", "event", "depth"]

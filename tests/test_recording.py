@@ -16,7 +16,7 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
 from sb3_have import HAVESAC
-from sb3_have.checkpoint.checkpoint import save_checkpoint
+from sb3_have.checkpoint import save_checkpoint
 from sb3_have.envs.drivers import RandomDriver
 from sb3_have.evaluation.recording import Recording, record_episode
 from sb3_have.evaluation.wrapping import saved_normalizer

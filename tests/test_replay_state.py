@@ -1,4 +1,4 @@
-"""Replay buffers in checkpoints: no larger than what is in them, and cut where the episodes begin anew."""
+"""Replay buffers in checkpoints, cut where new episodes begin."""
 
 import threading
 import warnings
@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from resuming import Drifting, assert_same, leaves
+from resuming import Drifting
 from stable_baselines3 import SAC, HerReplayBuffer
-from stable_baselines3.common.buffers import DictReplayBuffer, NStepReplayBuffer, ReplayBuffer
-from stable_baselines3.common.envs import BitFlippingEnv, SimpleMultiObsEnv
+from stable_baselines3.common.buffers import NStepReplayBuffer, ReplayBuffer
+from stable_baselines3.common.envs import BitFlippingEnv
 
 from sb3_have import ModalityReplayBuffer
-from sb3_have.checkpoint.checkpoint import load_checkpoint, save_checkpoint
-from sb3_have.checkpoint.replay_state import at_full_size, end_last_episode, filled_part
+from sb3_have.checkpoint import load_checkpoint, save_checkpoint
+from sb3_have.checkpoint.checkpoint import end_last_episode
 
 KINDS: dict[str, tuple[type[ReplayBuffer], dict[str, Any]]] = {
     "n steps": (NStepReplayBuffer, {"n_steps": 3, "gamma": 1.0}),
@@ -59,7 +59,7 @@ def test_nothing_runs_across_the_cut(kind: str, n_before: int) -> None:
     assert (samples.rewards[before, 0] < 1000).all()
     if buffer.handle_timeout_termination:
         last = before & (samples.next_observations[:, 0] == n_before)
-        assert 0.3 < samples.dones[last].mean() < 0.7, "of the episode that has ended alone"
+        assert 0.3 < samples.dones[last].mean() < 0.7, "only of the episode that has ended"
     cut = (n_before - 1) % SIZE
     for row in range(SIZE):
         if row != cut:
@@ -67,32 +67,10 @@ def test_nothing_runs_across_the_cut(kind: str, n_before: int) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_nothing_stored_is_nothing_to_end(kind: str) -> None:
+def test_empty_buffer_is_not_cut(kind: str) -> None:
     buffer = make_buffer(kind)
     end_last_episode(buffer)
     assert not buffer.dones.any() and not buffer.timeouts.any()
-
-
-@pytest.mark.parametrize("kind", KINDS)
-@pytest.mark.parametrize("n_steps", [0, 2, SIZE - 1, SIZE, SIZE + 2])
-def test_filled_part_is_all_there_is(kind: str, n_steps: int) -> None:
-    buffer = make_buffer(kind)
-    for step in range(n_steps):
-        add(buffer, step)
-    part = filled_part(buffer)
-    rest = at_full_size(part)
-    if kind != "frames once":
-        assert len(part.observations) == min(n_steps + 1, SIZE) and len(buffer.observations) == SIZE
-        assert np.shares_memory(part.observations, buffer.observations)
-    for step in range(n_steps, n_steps + SIZE + 1):
-        for one in (buffer, rest):
-            np.random.seed(step)
-            add(one, step)
-        samples = []
-        for one in (buffer, rest):
-            np.random.seed(step)
-            samples.append(leaves(one.sample(8)))
-        assert_same(*samples)
 
 
 def sac(env: Any, policy: str = "MultiInputPolicy", **kwargs: Any) -> SAC:
@@ -100,27 +78,8 @@ def sac(env: Any, policy: str = "MultiInputPolicy", **kwargs: Any) -> SAC:
     return SAC(policy, env, policy_kwargs=policy_kwargs, learning_starts=99, seed=0, device="cpu", **kwargs)
 
 
-@pytest.mark.parametrize("kind", [DictReplayBuffer, HerReplayBuffer])
-def test_file_holds_what_is_filled(kind: type[ReplayBuffer], tmp_path: Path) -> None:
-    def make_env() -> Any:
-        if kind is HerReplayBuffer:
-            return BitFlippingEnv(n_bits=3, continuous=True, max_steps=5)
-        return SimpleMultiObsEnv(discrete_actions=False, random_start=False)
-
-    model = sac(make_env(), buffer_size=3000, replay_buffer_class=kind).learn(20)
-    assert isinstance(model.replay_buffer, DictReplayBuffer)
-    save_checkpoint(model, tmp_path / "mine")
-    n_bytes = sum(array.nbytes for array in model.replay_buffer.observations.values())
-    if kind is DictReplayBuffer:
-        assert (tmp_path / "mine").stat().st_size < n_bytes, "twice that is reserved"
-    loaded = load_checkpoint(tmp_path / "mine", make_env(), device="cpu").replay_buffer
-    for name in ("observations", "next_observations"):
-        assert_same(leaves(getattr(loaded, name)), leaves(getattr(model.replay_buffer, name)))
-        assert all(array.flags.writeable for array in getattr(loaded, name).values())
-
-
-def test_no_second_buffer_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """SB3 would, and warn where there is no memory for both."""
+def test_no_second_buffer_is_created(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """SB3 would create one, and warn where there is no memory for both."""
     save_checkpoint(sac(Drifting(), "MlpPolicy", buffer_size=50).learn(9), tmp_path / "mine")
 
     def make(*args: Any, **kwargs: Any) -> None:
@@ -138,7 +97,7 @@ class Connected(Drifting):
         self.connection = threading.Lock()
 
 
-def test_episodes_that_begin_anew_are_cut(tmp_path: Path) -> None:
+def test_cut_where_new_episodes_begin(tmp_path: Path) -> None:
     model = sac(Connected(), "MlpPolicy", buffer_size=50, n_steps=3).learn(5)
     with pytest.warns(UserWarning, match=r"Connected\.connection"):
         save_checkpoint(model, tmp_path / "mine")
@@ -146,8 +105,8 @@ def test_episodes_that_begin_anew_are_cut(tmp_path: Path) -> None:
     assert resumed.replay_buffer.timeouts[:7, 0].tolist() == [0, 0, 0, 0, 1, 0, 0]
 
 
-def test_goals_are_cut_without_advice() -> None:
-    """SB3's warning tells how not to cut."""
+def test_goals_are_cut_without_warning() -> None:
+    """SB3 warns and advises not to cut."""
     env = BitFlippingEnv(n_bits=3, continuous=True, max_steps=5)
     model = sac(env, buffer_size=50, replay_buffer_class=HerReplayBuffer).learn(3)
     with warnings.catch_warnings():

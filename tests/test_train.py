@@ -1,10 +1,12 @@
-"""Training runs: resumed where they were, evaluations neither lost nor doubled, stopped in good order."""
+"""Training runs: resumed where they stopped, evaluations neither lost nor doubled, ended in good order."""
 
 import fcntl
 import multiprocessing
 import os
 import random
 import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,15 +21,40 @@ from resuming import assert_same, everything, leaves
 
 import sb3_have
 from sb3_have import train
-from sb3_have.checkpoint import files
-from sb3_have.checkpoint.checkpoint import save_checkpoint
+from sb3_have.checkpoint import StopTrainingOnSignal, checkpoints, newest_checkpoint, save_checkpoint
+from sb3_have.checkpoint.files import locked
 from sb3_have.configuration import load_config, model_kwargs
-from sb3_have.train import Run, make_training_env, newest_checkpoint
+from sb3_have.evaluation import callback
+from sb3_have.train import Run, make_training_env
 
 
 def make_run(out: Path, **kwargs: Any) -> Run:
     options = {"algo": "sac", "eval_freq": 10, "eval_episodes": 1, "weathers": ("slow", "fast"), "save_freq": 0}
     return Run(CONFIG, ENV_ID, out, **{**options, "device": "cpu", **kwargs})
+
+
+@contextmanager
+def acting_at(step: int, act: Callable[[], None]) -> Iterator[None]:
+    """Call a function in a training step of all runs of a ``with`` block."""
+
+    class Acting(StopTrainingOnSignal):
+        def _on_step(self) -> bool:
+            if self.num_timesteps == step:
+                act()
+            return super()._on_step()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(train, "StopTrainingOnSignal", Acting)
+        yield
+
+
+def press_ctrl_c(times: int = 1) -> None:
+    for _ in range(times):
+        os.kill(os.getpid(), signal.SIGINT)
+
+
+def die() -> None:
+    raise MemoryError
 
 
 def test_resumed_run_goes_on(tmp_path: Path) -> None:
@@ -55,8 +82,10 @@ def test_finished_run_is_not_touched(tmp_path: Path) -> None:
 
 
 def test_records_after_the_checkpoint_are_dropped(tmp_path: Path) -> None:
-    """As when a run is killed between two checkpoints."""
-    make_run(tmp_path, save_freq=20).train(35, keep_checkpoint=False)
+    """As after a run was killed between two checkpoints."""
+    with acting_at(35, die), pytest.raises(MemoryError):
+        make_run(tmp_path, save_freq=20).train(40)
+    assert list(pd.read_csv(tmp_path / "evaluation.csv")["step"]) == [10, 10, 20, 20, 30, 30]
     assert newest_checkpoint(tmp_path) == tmp_path / "checkpoint-20"
     make_run(tmp_path).train(40)
     assert list(pd.read_csv(tmp_path / "evaluation.csv")["step"]) == [10, 10, 20, 20, 30, 30, 40, 40]
@@ -70,7 +99,7 @@ def test_folder_of_another_run_is_refused(tmp_path: Path) -> None:
 
 
 def test_records_of_others_are_not_removed(tmp_path: Path) -> None:
-    """But those of a run that was killed before its first checkpoint are."""
+    """Those of a run that was killed before its first checkpoint are."""
     for name in ("monitor.csv", "3.monitor.csv", "evaluation.csv"):
         others = tmp_path / name.removesuffix(".csv") / name
         others.parent.mkdir()
@@ -78,8 +107,8 @@ def test_records_of_others_are_not_removed(tmp_path: Path) -> None:
         with pytest.raises(ValueError, match=f"{name} is of no run of this program; remove it, or choose another"):
             make_run(others.parent).train(8)
         assert others.read_text() == "of another program" and not (others.parent / "model.zip").exists()
-    make_run(tmp_path / "mine").train(12, keep_checkpoint=False)
-    (tmp_path / "mine" / "model.zip").unlink()
+    with acting_at(12, die), pytest.raises(MemoryError):
+        make_run(tmp_path / "mine").train(12)
     make_run(tmp_path / "mine").train(12)
     assert len(pd.read_csv(tmp_path / "mine" / "evaluation.csv")) == 2
 
@@ -92,7 +121,7 @@ def test_incomplete_checkpoint_is_ignored(tmp_path: Path) -> None:
 
 
 def outcome(run: Run, model: Any) -> dict[str, Any]:
-    """All that a run leaves, but for times."""
+    """Return everything that a run leaves, except for times."""
     evaluations = pd.read_csv(run.out / "evaluation.csv").drop(columns="wall_time")
     episodes = pd.read_csv(run.out / "monitor.csv", skiprows=1).drop(columns="t")
     return everything(model) | leaves({"evaluations": evaluations.to_numpy(), "episodes": episodes.to_numpy()})
@@ -104,37 +133,26 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return outcome(run, run.train(40))
 
 
-@pytest.mark.parametrize("n_signals", [0, 1, 2], ids=["killed", "stopped", "stopped at once"])
-def test_resumed_run_is_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, uninterrupted: dict[str, Any], n_signals: int
-) -> None:
-    """Bit for bit, evaluations and all."""
-
-    class Interrupted(train.RunCallback):
-        def _on_step(self) -> bool:
-            for _ in range(n_signals if self.num_timesteps == 25 else 0):
-                os.kill(os.getpid(), signal.SIGINT)
-            return super()._on_step()
-
-    with monkeypatch.context() as patch:
-        patch.setattr(train, "RunCallback", Interrupted)
-        run = make_run(tmp_path, save_freq=10)
-        run.train(28, keep_checkpoint=n_signals > 0)
-    assert run.interrupted == (n_signals > 0)
-    assert newest_checkpoint(tmp_path) == tmp_path / ("checkpoint-25" if n_signals == 1 else "checkpoint-20")
-    assert (tmp_path / "model.zip").exists() == (n_signals < 2)
+@pytest.mark.parametrize("how", ["killed", "stopped", "stopped at once"])
+def test_resumed_run_is_the_same(tmp_path: Path, uninterrupted: dict[str, Any], how: str) -> None:
+    """Bit for bit, including evaluations."""
+    run = make_run(tmp_path, save_freq=10)
+    if how == "stopped":
+        with acting_at(25, press_ctrl_c):
+            run.train(40)
+    else:
+        act = die if how == "killed" else partial(press_ctrl_c, times=2)
+        with acting_at(25, act), pytest.raises((MemoryError, KeyboardInterrupt)):
+            run.train(40)
+    assert run.interrupted == (how == "stopped")
+    assert newest_checkpoint(tmp_path) == tmp_path / ("checkpoint-25" if how == "stopped" else "checkpoint-20")
+    assert (tmp_path / "model.zip").exists() == (how == "stopped")
     again = make_run(tmp_path)
     assert_same(outcome(again, again.train(40)), uninterrupted)
 
 
-def test_resumed_schedule_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_resumed_schedule_continues(tmp_path: Path) -> None:
     """The learning rate is that of the whole run, and so are the weights, bit for bit."""
-
-    class Interrupted(train.RunCallback):
-        def _on_step(self) -> bool:
-            if self.num_timesteps == 25:
-                os.kill(os.getpid(), signal.SIGINT)
-            return super()._on_step()
 
     def run(name: str) -> Run:
         made = make_run(tmp_path / name)
@@ -143,8 +161,7 @@ def test_resumed_schedule_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
     uninterrupted = run("whole")
     expected = outcome(uninterrupted, uninterrupted.train(40))
-    with monkeypatch.context() as patch:
-        patch.setattr(train, "RunCallback", Interrupted)
+    with acting_at(25, press_ctrl_c):
         stopped: Any = run("stopped").train(40)
     assert stopped.num_timesteps == 25
     assert stopped.critic.optimizer.param_groups[0]["lr"] == pytest.approx(1e-3 * 15 / 40)
@@ -159,7 +176,7 @@ def test_evaluations_do_not_disturb(
         random.random(), np.random.rand(3), th.rand(3)
         return sb3_have.evaluate(*args, **kwargs)
 
-    monkeypatch.setattr(train, "evaluate", evaluate)
+    monkeypatch.setattr(callback, "evaluate", evaluate)
     run = make_run(tmp_path, eval_freq=3)
     model = run.train(40)
     assert len(pd.read_csv(tmp_path / "evaluation.csv")) == 2 * 13
@@ -168,61 +185,61 @@ def test_evaluations_do_not_disturb(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_signal_ends_training_and_saves(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: signal.Signals
-) -> None:
-    """The step in which the signal comes is finished; the handlers are given back."""
-
-    class Interrupted(train.RunCallback):
-        def _on_step(self) -> bool:
-            if self.num_timesteps == 15:
-                os.kill(os.getpid(), number)
-            return super()._on_step()
-
-    monkeypatch.setattr(train, "RunCallback", Interrupted)
+def test_signal_ends_training_and_saves(tmp_path: Path, number: signal.Signals) -> None:
+    """The step in which the signal arrives is finished; the handlers are restored."""
     before = signal.getsignal(number)
     run = make_run(tmp_path, eval_freq=0)
-    assert run.train(1000).num_timesteps == 15
+    with acting_at(15, lambda: os.kill(os.getpid(), number)):
+        assert run.train(1000).num_timesteps == 15
     assert run.interrupted and newest_checkpoint(tmp_path) == tmp_path / "checkpoint-15"
     assert (tmp_path / "model.zip").is_file()
     assert signal.getsignal(number) == before
 
 
-@pytest.mark.parametrize("steps", [10, 20])
-@pytest.mark.parametrize("moment", ["before", "within"])
-def test_evaluation_that_a_stop_prevents_is_made_up_for(
+@pytest.mark.parametrize(("moment", "steps"), [("before", 20), ("within", 20), ("within", 10)])
+def test_interrupted_evaluation_is_made_up_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, moment: str, steps: int
 ) -> None:
-    def stop(*args: Any, **kwargs: Any) -> None:
-        os.kill(os.getpid(), signal.SIGINT)
-
-    class Interrupted(train.RunCallback):
-        def _on_step(self) -> bool:
-            if self.num_timesteps == 10:
-                stop()
-            return super()._on_step()
-
+    run = make_run(tmp_path)
     with monkeypatch.context() as patch:
-        patch.setattr(
-            train, "evaluate" if moment == "within" else "RunCallback", stop if moment == "within" else Interrupted
-        )
-        run = make_run(tmp_path)
-        assert run.train(steps).num_timesteps == 10
-        assert run.interrupted and not (tmp_path / "evaluation.csv").exists()
+        if moment == "within":
+            patch.setattr(callback, "evaluate", lambda *args, **kwargs: press_ctrl_c())
+        with acting_at(10, press_ctrl_c if moment == "before" else lambda: None):
+            assert run.train(steps).num_timesteps == 10
+    assert run.interrupted and not (tmp_path / "evaluation.csv").exists()
     again = make_run(tmp_path)
     again.train(steps)
-    assert list(pd.read_csv(tmp_path / "evaluation.csv")["step"]) == [10, 10, 20, 20][: 2 * steps // 10]
+    frame = pd.read_csv(tmp_path / "evaluation.csv")
+    assert list(frame["step"]) == [10, 10, 20, 20][: 2 * steps // 10]
     assert not again.interrupted
 
 
+def test_ctrl_c_in_an_evaluation_without_handler(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is not swallowed."""
+    monkeypatch.setattr(callback, "evaluate", lambda *args, **kwargs: press_ctrl_c())
+    model = make_run(tmp_path, eval_freq=0).train(8)
+    model.set_env(make_training_env(ENV_ID, CONFIG))
+    with pytest.raises(KeyboardInterrupt):
+        model.learn(8, callback.WeatherEvalCallback(ENV_ID, ["slow"], tmp_path / "rows.csv", eval_freq=5))
+
+
+def test_evaluations_of_another_training_are_kept(tmp_path: Path) -> None:
+    model = make_run(tmp_path).train(12)
+    model.set_env(make_training_env(ENV_ID, CONFIG))
+    before = (tmp_path / "evaluation.csv").read_text()
+    with pytest.raises(ValueError, match="has the evaluations of another training"):
+        model.learn(12, callback.WeatherEvalCallback(ENV_ID, ["slow"], tmp_path / "evaluation.csv"))
+    assert (tmp_path / "evaluation.csv").read_text() == before
+
+
 def test_folder_is_for_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(train, "locked", partial(files.locked, patience=0.0))
-    with (tmp_path / ".lock").open("w") as other:
+    with (tmp_path / ".lock").open("w") as other, monkeypatch.context() as patch:
+        patch.setattr(train, "locked", lambda folder: locked(folder, patience=0.0))
         fcntl.flock(other, fcntl.LOCK_EX)  # as another process does
         with pytest.raises(BlockingIOError, match="another process works in"):
             make_run(tmp_path).train(8)
     assert not (tmp_path / "model.zip").exists()
-    with files.locked(tmp_path), files.locked(tmp_path):  # once a process has it, it has it
+    with locked(tmp_path), locked(tmp_path):  # a process may lock a folder twice
         assert make_run(tmp_path, eval_freq=0).train(8).num_timesteps == 8
         with (tmp_path / ".lock").open("w") as other, pytest.raises(BlockingIOError):
             fcntl.flock(other, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -232,13 +249,13 @@ def test_folder_is_for_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 def test_model_without_checkpoint_is_not_trained_over(tmp_path: Path) -> None:
     make_run(tmp_path).train(12, keep_checkpoint=False)
-    with pytest.raises(ValueError, match=r"no checkpoint to go on from"):
+    with pytest.raises(ValueError, match=r"no checkpoint to resume from"):
         make_run(tmp_path).train(12)
     assert len(pd.read_csv(tmp_path / "evaluation.csv")) == 2
 
 
 def test_damaged_checkpoints(tmp_path: Path) -> None:
-    """The newest is written again when the run comes by; if no other is left, nothing is thrown away."""
+    """The newest is written again when the run gets there; if no other is left, nothing is overwritten."""
     make_run(tmp_path, save_freq=6).train(12)
     (tmp_path / "checkpoint-12").write_bytes(b"")
     with pytest.warns(UserWarning, match="checkpoint-12 is damaged"):
@@ -265,17 +282,13 @@ def test_two_checkpoints_stay(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.glob("checkpoint*")} == {"checkpoint-20", "checkpoint-22"}
 
 
-def test_checkpoint_of_older_form_is_refused(tmp_path: Path) -> None:
-    older = tmp_path / "checkpoint-8"
-    older.mkdir()
-    for name in ("model.zip", "replay_buffer.pkl", "state.json"):
-        (older / name).touch()
-    with pytest.raises(ValueError, match=r"checkpoint-8 is a checkpoint of an older form"):
-        make_run(tmp_path).train(12)
-    assert not (tmp_path / "model.zip").exists()
+def test_without_checkpoints(tmp_path: Path) -> None:
+    make_run(tmp_path, save_freq=5).train(12, keep_checkpoint=False)
+    assert not checkpoints(tmp_path) and (tmp_path / "model.zip").exists()
 
 
 def test_time_limit(tmp_path: Path) -> None:
+    """At least one rollout is made, so that there is a checkpoint."""
     run = make_run(tmp_path, eval_freq=0, time_limit=0.0)
     assert run.train(1000).num_timesteps == 1
     assert not run.interrupted
@@ -332,5 +345,5 @@ def test_shipped_configuration_fits_havesac() -> None:
 @pytest.mark.parametrize("progress_bar", [True, False])
 def test_evaluations_have_a_progress_bar(tmp_path: Path, progress_bar: bool, capfd: pytest.CaptureFixture[str]) -> None:
     make_run(tmp_path).train(12, progress_bar=progress_bar)
-    told = "".join(capfd.readouterr())
-    assert ("2/2" in told and "episode" in told) == progress_bar
+    output = "".join(capfd.readouterr())
+    assert ("2/2" in output and "episode" in output) == progress_bar

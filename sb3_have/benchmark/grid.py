@@ -44,7 +44,7 @@ from sb3_have.train import algorithm_of, algorithms
 
 FINAL_SEED = 2_000_000
 """Seed of the first episode after training, the same for all methods and seeds. No run is trained on these episodes
-or chosen by them (:data:`sb3_have.train.EVALUATION_SEED`)."""
+or chosen by them (:data:`sb3_have.evaluation.callback.EVALUATION_SEED`)."""
 
 NOT_OF_THE_MODEL = {"n_envs", "frame_stack", "env_kwargs", "env_wrapper"}
 OWN_ENVS = ("HighwayVision-v0", "CarlaVision-v0")

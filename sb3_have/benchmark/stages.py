@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import shutil
 from collections import deque
 from collections.abc import Sequence
 from functools import partial
@@ -30,7 +29,7 @@ from sb3_have.benchmark.grid import Failures, Job
 from sb3_have.benchmark.machine import machine
 from sb3_have.benchmark.reading import FILES
 from sb3_have.benchmark.results import difference, read_text_table, settings_column
-from sb3_have.checkpoint.checkpoint import checkpoint_step, checkpoints
+from sb3_have.checkpoint import checkpoint_step, checkpoints
 from sb3_have.checkpoint.files import locked, write_atomically
 from sb3_have.configuration import Env, env_wrapper, evaluation_env_kwargs
 from sb3_have.evaluation.episodes import EpisodeQueue, Task, match_observations
@@ -130,11 +129,8 @@ def _reload(job: Job, folder: Path, record: dict[str, Any], device: str) -> OffP
 
 
 def _drop_checkpoints(folder: Path) -> None:
-    for remains in folder.glob("checkpoint*"):
-        if remains.is_dir():  # of an older form
-            shutil.rmtree(remains)
-        else:
-            remains.unlink()
+    for remains in folder.glob("checkpoint-*"):
+        remains.unlink()
 
 
 def n_parameters(model: OffPolicyAlgorithm) -> int:

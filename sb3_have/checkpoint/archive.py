@@ -1,8 +1,7 @@
-"""The file of a checkpoint: pickled state and large arrays in a zip archive that appears whole or not at all."""
+"""The file format of checkpoints: a zip archive of pickled state and large arrays, written completely or not at all."""
 
 from __future__ import annotations
 
-import errno
 import io
 import json
 import os
@@ -15,29 +14,29 @@ from pathlib import Path
 from types import FunctionType
 from typing import IO, Any
 
-import cloudpickle  # type: ignore[import-untyped, unused-ignore]  # of SB3's requirements
+import cloudpickle  # type: ignore[import-untyped, unused-ignore]  # a dependency of SB3
 import numpy as np
 
+from sb3_have.checkpoint.files import write_atomically
+
+# Arrays of at least so many bytes become entries of their own, written from memory and read into memory without a copy.
 LARGE = 1 << 20
-"""Bytes from which on an array is an entry of its own, which is written from its memory and read into it."""
 
-ENTRIES = ("info.json", "model.zip", "state.pkl")
-"""What every archive begins with; large arrays follow."""
-
-DAMAGES = (zipfile.BadZipFile, KeyError, EOFError, NotImplementedError, RuntimeError, ValueError)
-"""What ``zipfile`` raises where bytes are missing or others, besides OSError EINVAL and EIO."""
+# The first entries of every archive; large arrays follow.
+ENTRIES = ["info.json", "model.zip", "state.pkl"]
 
 
 class DamagedCheckpointError(ValueError):
-    """A checkpoint that cannot be read: cut off, changed, or no checkpoint at all."""
+    """A file that is truncated, corrupted or not a checkpoint."""
 
 
 class Pickler(cloudpickle.Pickler):  # type: ignore[misc, unused-ignore]
-    """Pickles functions too, and stands numbers for objects that exist on the other side already.
+    """Pickler for lambdas too, which refers to objects that exist on both sides by their number.
 
-    :param file: to write to
-    :param existing: objects that are not pickled, wherever they occur: :class:`Unpickler` puts its own in their place
-    :param buffer_callback: as of ``pickle.Pickler``
+    :param file: File to write to
+    :param existing: Objects to refer to instead of pickling them; the :class:`Unpickler` needs its own, in the same
+        order
+    :param buffer_callback: See ``pickle.Pickler``
     """
 
     def __init__(self, file: IO[bytes], existing: Sequence[object] = (), buffer_callback: Any = None):
@@ -48,7 +47,8 @@ class Pickler(cloudpickle.Pickler):  # type: ignore[misc, unused-ignore]
         return self._numbers.get(id(obj))
 
     def reducer_override(self, obj: Any) -> Any:
-        # cloudpickle would copy what the running script defines; when that runs again, it has these classes itself
+        # cloudpickle copies the classes of the running script, and isinstance fails for the copies when the script
+        # runs again: pickle them by name
         if isinstance(obj, type | FunctionType):
             name: str = obj.__qualname__
             if getattr(sys.modules["__main__"], name, None) is obj:
@@ -57,10 +57,11 @@ class Pickler(cloudpickle.Pickler):  # type: ignore[misc, unused-ignore]
 
 
 class Unpickler(pickle.Unpickler):
-    """
-    :param file: that a :class:`Pickler` wrote
-    :param existing: as many objects as it had, in the same order
-    :param buffers: as of ``pickle.Unpickler``
+    """Reads what :class:`Pickler` wrote.
+
+    :param file: File to read from
+    :param existing: Objects in place of those that the pickler referred to
+    :param buffers: See ``pickle.Unpickler``
     """
 
     def __init__(self, file: IO[bytes], existing: Sequence[object] = (), buffers: Any = None):
@@ -72,58 +73,57 @@ class Unpickler(pickle.Unpickler):
 
 
 def dumps(obj: Any, existing: Sequence[object] = ()) -> bytes:
-    """An object as bytes, see :class:`Pickler`."""
+    """Pickle an object, see :class:`Pickler`."""
     file = io.BytesIO()
     Pickler(file, existing).dump(obj)
     return file.getvalue()
 
 
 def loads(data: bytes, existing: Sequence[object] = ()) -> Any:
-    """The object of :func:`dumps`."""
+    """Unpickle the object of :func:`dumps`."""
     return Unpickler(io.BytesIO(data), existing).load()
 
 
 def write_archive(path: Path, info: Mapping[str, Any], model: memoryview, state: Any) -> None:
-    """Write an archive, or leave what is there as it is.
+    """Write an archive, without copying large arrays.
 
-    Large arrays are written from where they lie, so that this takes hardly any memory.
-
-    :param path: of the file; its folder is made where it is missing
-    :param info: small, in JSON
-    :param model: the model's own file
-    :param state: to pickle
-    :raises OSError: if it cannot be written, as on a full disk; nothing is left of it then
+    :param path: Path of the file; missing folders are created
+    :param info: A few values for JSON
+    :param model: Content of the model's own zip
+    :param state: Anything that can be pickled
+    :raises OSError: If the file cannot be written, for instance on a full disk; the previous file is kept then
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = path.with_name(f"{path.name}.partial")
-    try:
+
+    def write(unfinished: Path) -> None:
         with open(unfinished, "wb") as file:
-            with zipfile.ZipFile(file, "w") as archive:  # stored, not compressed: images of sensors gain little
-                archive.writestr("info.json", json.dumps(info, indent=1))
-                with archive.open("model.zip", "w", force_zip64=True) as entry:
-                    entry.write(model)
-                arrays: list[pickle.PickleBuffer] = []
-                with archive.open("state.pkl", "w", force_zip64=True) as entry:
-                    Pickler(entry, buffer_callback=lambda array: _set_aside(array, arrays)).dump(state)
-                for number, array in enumerate(arrays):
-                    with archive.open(f"array-{number}", "w", force_zip64=True) as entry:
-                        entry.write(array.raw())
+            _write(file, info, model, state)
             file.flush()
             os.fsync(file.fileno())
-        os.replace(unfinished, path)
-    except BaseException:
-        with suppress(OSError):
-            unfinished.unlink()
-        raise
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, write)
     _sync_folder(path.parent)
 
 
-def _set_aside(array: pickle.PickleBuffer, arrays: list[pickle.PickleBuffer]) -> bool:
-    """Whether an array stays in the pickle."""
-    if array.raw().nbytes < LARGE:
-        return True
-    arrays.append(array)
-    return False
+def _write(file: IO[bytes], info: Mapping[str, Any], model: memoryview, state: Any) -> None:
+    arrays: list[pickle.PickleBuffer] = []
+
+    def stays_in_pickle(array: pickle.PickleBuffer) -> bool:
+        if array.raw().nbytes < LARGE:
+            return True
+        arrays.append(array)
+        return False
+
+    # Do not compress: images of sensors gain little
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_STORED) as archive:
+        archive.writestr("info.json", json.dumps(info, indent=1))
+        with archive.open("model.zip", "w", force_zip64=True) as entry:
+            entry.write(model)
+        with archive.open("state.pkl", "w", force_zip64=True) as entry:
+            Pickler(entry, buffer_callback=stays_in_pickle).dump(state)
+        for number, array in enumerate(arrays):
+            with archive.open(f"array-{number}", "w", force_zip64=True) as entry:
+                entry.write(array.raw())
 
 
 def _sync_folder(folder: Path) -> None:
@@ -138,22 +138,22 @@ def _sync_folder(folder: Path) -> None:
 
 
 def read_archive(path: Path) -> tuple[dict[str, Any], io.BytesIO, Any]:
-    """What :func:`write_archive` wrote: the info, the model's file and the state.
+    """Read info, model and state from the file of :func:`write_archive`.
 
-    The state is unpickled, which can run any code: read nothing but what you wrote.
+    The state is unpickled, which can execute any code: read only files that you wrote yourself.
 
-    :raises DamagedCheckpointError: if a checksum is wrong, or the file is cut off; nothing has been unpickled then
+    :raises DamagedCheckpointError: If the file is truncated or a checksum is wrong; nothing is unpickled then
     """
     with _opened(path) as archive:
         info = json.loads(archive.read("info.json"))
         model, pickled = io.BytesIO(archive.read("model.zip")), archive.read("state.pkl")
         arrays = [_read_array(archive, name) for name in archive.namelist()[len(ENTRIES) :]]
-    # outside, where an error is no damage but a class that is missing or another
+    # An error from here on is not damage, but for instance a class that no longer exists
     return info, model, Unpickler(io.BytesIO(pickled), buffers=arrays).load()
 
 
 def _read_array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    """An entry in memory of its own; the checksum is compared at its end."""
+    """Read an entry into an array; ``zipfile`` compares the checksum at the end."""
     array = np.empty(archive.getinfo(name).file_size, np.uint8)
     start = 0
     with archive.open(name) as entry:
@@ -164,45 +164,37 @@ def _read_array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
 
 
 def read_info(path: Path) -> dict[str, Any]:
-    """The info of an archive alone.
+    """Read only the info of an archive.
 
-    :raises DamagedCheckpointError: if it cannot be read
+    :raises DamagedCheckpointError: If it cannot be read
     """
     with _opened(path) as archive:
         return dict(json.loads(archive.read("info.json")))
 
 
-def check_archive(path: Path) -> None:
-    """Compare all checksums.
-
-    :raises DamagedCheckpointError: if one is wrong, or the file is cut off
-    """
-    with _opened(path) as archive:
-        broken = archive.testzip()
-        if broken is not None:
-            raise zipfile.BadZipFile(f"Bad CRC-32 for file {broken!r}")
-
-
-def _check_directory(archive: zipfile.ZipFile) -> None:
-    """Names and lengths, which have no checksum; and cut off, a file may end with the model, an archive too."""
-    entries = archive.infolist()
-    names = [*ENTRIES, *(f"array-{number}" for number in range(len(entries) - len(ENTRIES)))]
-    stored = all(
-        entry.compress_type == zipfile.ZIP_STORED and entry.compress_size == entry.file_size for entry in entries
-    )
-    if not stored or [entry.filename for entry in entries] != names:
-        raise zipfile.BadZipFile("its entries are not those of a checkpoint")
+def damage(path: Path) -> DamagedCheckpointError | None:
+    """Compare all checksums, and return what is wrong with a checkpoint or None."""
+    try:
+        with _opened(path) as archive:
+            if broken := archive.testzip():
+                raise zipfile.BadZipFile(f"Bad CRC-32 for file {broken!r}")
+    except DamagedCheckpointError as error:
+        return error
+    return None
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
     try:
         with zipfile.ZipFile(path) as archive:
-            _check_directory(archive)
+            # Names and sizes have no checksum; a truncated file may also end with the zip of the model
+            entries = archive.infolist()
+            names = ENTRIES + [f"array-{number}" for number in range(len(entries) - len(ENTRIES))]
+            stored = all(entry.compress_size == entry.file_size and entry.compress_type == 0 for entry in entries)
+            if [entry.filename for entry in entries] != names or not stored:
+                raise zipfile.BadZipFile("its entries are not those of a checkpoint")
             yield archive
-    except (*DAMAGES, OSError) as error:
-        if isinstance(error, OSError) and error.errno not in (errno.EINVAL, errno.EIO, None):
-            raise  # there is no such file, or it may not be read
-        raise DamagedCheckpointError(
-            f"{path} is damaged or no checkpoint at all ({error}); go on from another one"
-        ) from error
+    except (FileNotFoundError, PermissionError, IsADirectoryError):
+        raise
+    except Exception as error:  # zipfile raises many kinds for corrupted bytes
+        raise DamagedCheckpointError(f"{path} is damaged or not a checkpoint ({error}); use another one") from error

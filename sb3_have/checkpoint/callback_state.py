@@ -1,80 +1,74 @@
-"""The state of callbacks: whatever is plain data in them, or what they choose."""
+"""The state of callbacks: of SB3's own, and of those with ``get_state`` and ``set_state``."""
 
 from __future__ import annotations
 
-import inspect
-import random
-from collections import deque
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Protocol, runtime_checkable
 
-import numpy as np
-import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ProgressBarCallback
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    EvalCallback,
+    EveryNTimesteps,
+    StopTrainingOnMaxEpisodes,
+    StopTrainingOnNoModelImprovement,
+)
 
 Callbacks = BaseCallback | Sequence[BaseCallback] | None
 
-PLAIN = (bool, int, float, complex, str, bytes, np.ndarray, np.generic, th.Tensor, type(None))
-PLAIN_RANDOM = (np.random.Generator, np.random.RandomState, random.Random)
-CONTAINERS = (list, tuple, set, frozenset, deque)
+# What SB3's callbacks remember from one step to the next
+ATTRIBUTES: dict[Any, tuple[str, ...]] = {
+    BaseCallback: ("n_calls",),
+    EvalCallback: (
+        "best_mean_reward",
+        "last_mean_reward",
+        "evaluations_results",
+        "evaluations_timesteps",
+        "evaluations_length",
+        "evaluations_successes",
+    ),
+    EveryNTimesteps: ("last_time_trigger",),
+    StopTrainingOnMaxEpisodes: ("n_episodes",),
+    StopTrainingOnNoModelImprovement: ("last_best_mean_reward", "no_improvement_evals"),
+}
+
+
+@runtime_checkable
+class Stateful(Protocol):
+    """A callback that chooses its own state."""
+
+    def get_state(self) -> Any: ...
+    def set_state(self, state: Any) -> None: ...
 
 
 def _flattened(callbacks: Callbacks) -> list[BaseCallback]:
-    """Callbacks and those within them, but for mere lists and the progress bar."""
-    waiting = [callbacks] if isinstance(callbacks, BaseCallback) else list(callbacks or ())
+    """List callbacks and the callbacks within them, as SB3's own nest them."""
     found: list[BaseCallback] = []
-    while waiting:
-        callback = waiting.pop(0)
-        if any(callback is each for each in found):
-            continue
-        found.append(callback)
-        for name, value in vars(callback).items():
-            children = value if isinstance(value, list | tuple) else [value]
-            if name != "parent":
-                waiting += [child for child in children if isinstance(child, BaseCallback)]
-    return [each for each in found if not isinstance(each, CallbackList | ProgressBarCallback)]
+    for callback in [callbacks] if isinstance(callbacks, BaseCallback) else callbacks or ():
+        children = [getattr(callback, name, None) for name in ("callback", "callback_on_new_best")]
+        children += getattr(callback, "callbacks", [])
+        found += [callback, *_flattened([child for child in children if isinstance(child, BaseCallback)])]
+    return found
 
 
-def callbacks_state(callbacks: Callbacks) -> list[tuple[str, Any]]:
-    """Class and state of every callback, see :func:`~sb3_have.checkpoint.checkpoint.save_checkpoint`."""
-    return [(type(each).__qualname__, _callback_state(each)) for each in _flattened(callbacks)]
+def callbacks_state(callbacks: Callbacks) -> list[tuple[str, dict[str, Any], Any]]:
+    """Return class, attributes and own state of every callback."""
+    states = []
+    for callback in _flattened(callbacks):
+        names = [name for base in ATTRIBUTES if isinstance(callback, base) for name in ATTRIBUTES[base]]
+        attributes = {name: getattr(callback, name) for name in names}
+        own = callback.get_state() if isinstance(callback, Stateful) else None
+        states.append((type(callback).__qualname__, attributes, own))
+    return states
 
 
-def _has_own_state(callback: BaseCallback) -> bool:
-    return hasattr(callback, "get_state") and hasattr(callback, "set_state")
-
-
-def _callback_state(callback: BaseCallback) -> Any:
-    if _has_own_state(callback):
-        return callback.get_state()  # type: ignore[attr-defined]
-    # what the constructor takes is the user's, who may give something else when the training goes on
-    constructors = [vars(each)["__init__"] for each in type(callback).__mro__ if "__init__" in vars(each)]
-    given = {name for each in constructors for name in inspect.signature(each).parameters} | {
-        "locals",
-        "globals",
-        "parent",
-    }
-    return {name: value for name, value in vars(callback).items() if name not in given and _is_plain(value)}
-
-
-def _is_plain(value: Any) -> bool:
-    if isinstance(value, Mapping):
-        return all(_is_plain(each) for pair in value.items() for each in pair)
-    if isinstance(value, CONTAINERS):
-        return all(map(_is_plain, value))
-    return isinstance(value, (*PLAIN, *PLAIN_RANDOM))
-
-
-def restore_callbacks(callbacks: Callbacks, states: list[tuple[str, Any]]) -> None:
-    """Put callbacks into the state that those of the same classes had, in their order."""
+def restore_callbacks(callbacks: Callbacks, states: list[tuple[str, dict[str, Any], Any]]) -> None:
+    """Restore callbacks from the states of those of the same class, in their order; others stay as they are."""
     waiting = list(states)
     for callback in _flattened(callbacks):
-        name = type(callback).__qualname__
-        index = next((index for index, (saved, _) in enumerate(waiting) if saved == name), None)
+        index = next((i for i, (name, *_) in enumerate(waiting) if name == type(callback).__qualname__), None)
         if index is None:
-            continue  # it was not there then
-        _, state = waiting.pop(index)
-        if _has_own_state(callback):
-            callback.set_state(state)  # type: ignore[attr-defined]
-        else:
-            vars(callback).update(state)
+            continue
+        _, attributes, own = waiting.pop(index)
+        vars(callback).update(attributes)
+        if isinstance(callback, Stateful):
+            callback.set_state(own)

@@ -14,8 +14,8 @@ import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import Image, TensorBoardOutputFormat
 
-from sb3_have.checkpoint.checkpoint import same_random_numbers
 from sb3_have.checkpoint.files import write_atomically
+from sb3_have.checkpoint.random_state import same_random_numbers
 from sb3_have.evaluation.recording import record_episode, weighing
 
 if TYPE_CHECKING:
