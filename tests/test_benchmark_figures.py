@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
 
-from sb3_have.benchmark import breakdown, figures, tables
+from sb3_have.benchmark import figures, tables
 from sb3_have.benchmark.reading import DISTANCE, RETURN, Results
 
 
@@ -165,7 +165,7 @@ def test_weights_over_an_episode(tmp_path: Path) -> None:
 def test_failure_bars(tmp_path: Path) -> None:
     rows = failure_rows({"have": {0: (100.0, 60.0), 1: (200.0, 110.0)}, "sac": {0: (60.0, 150.0)}})
     rows += [row for row in failure_rows({"sac": {0: (60.0, 45.0)}}, "event") if row["kind"] == "black"]
-    table = breakdown.failure_table(read(tmp_path, final=final(), failures=rows))
+    table = tables.failure_table(read(tmp_path, final=final(), failures=rows))
     figure = figures.plot_failures(table, RETURN)
     rgb, event = panel(figure, "rgb fails"), panel(figure, "event fails")
     assert bars(rgb) == {"#888888": [1, 10], "#000000": [10, 3.5]}
@@ -179,7 +179,7 @@ def test_failure_bars(tmp_path: Path) -> None:
 def test_failure_bars_stand_over_their_kind(tmp_path: Path) -> None:
     black = failure_rows({"have": {0: (100.0, 60.0)}, "sac": {0: (100.0, 70.0)}})
     noise = [row | moments(row["distance_mean"] - 30, 1) | {"kind": "noise"} for row in black if row["kind"] == "black"]
-    table = breakdown.failure_table(read(tmp_path, final=final(), failures=[*black, *noise]))
+    table = tables.failure_table(read(tmp_path, final=final(), failures=[*black, *noise]))
     (axis,) = figures.plot_failures(table, DISTANCE).axes
     assert [tick.get_text() for tick in axis.get_xticklabels()] == ["none", "rgb black", "rgb noise"]
     sac, have = (group.patches for group in axis.containers if isinstance(group, BarContainer))

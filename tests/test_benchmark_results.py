@@ -28,7 +28,7 @@ def test_results_of_other_settings_are_refused(tmp_path: Path) -> None:
         ({"weathers": ["slow"]}, "weathers: ['fast', 'slow'], now ['slow']"),
     ]:
         other = make_grid(tmp_path, **changes).jobs()[0]  # type: ignore[arg-type]
-        with pytest.raises(GridError, match="holds gve-0 with other settings") as error:
+        with pytest.raises(GridError, match="contains gve-0 with other settings") as error:
             is_finished(results, other)
         assert f"({told})" in str(error.value)
     assert not is_finished(results, make_grid(tmp_path, config={"gamma": 0.5}).jobs()[1]), "another run, not yet there"

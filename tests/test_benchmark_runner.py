@@ -62,11 +62,11 @@ def test_results_of_a_grid(tmp_path: Path) -> None:
     for key, rows in weights.groupby(["seed", "weather"]):
         first = episodes.set_index(["method", "seed", "weather"]).loc[[("have", *key)]].iloc[0]
         assert (rows["episode_seed"] == first["episode_seed"]).all()
-        assert list(rows["t"]) == [t for t in range(first["steps"]) for _ in range(2)]
+        assert list(rows["t"]) == [t for t in range(0, first["steps"], 5) for _ in range(2)]
         assert rows["return_so_far"].iloc[0] == 0 and rows["return_so_far"].is_monotonic_increasing
-        gained = np.diff(rows["return_so_far"].iloc[::2])
-        # the policy is deterministic and sees this environment change little
-        np.testing.assert_allclose(first["return"] - rows["return_so_far"].iloc[-1], gained.mean(), rtol=0.2)
+        # The untrained policy gains about the same in every step
+        so_far = rows["return_so_far"].to_numpy()[::2]
+        np.testing.assert_allclose(so_far, first["return"] * rows["t"][::2] / first["steps"], rtol=0.1)
 
     failures = read(results, "failures")
     of_run = failures.query("method == 'gve' and seed == 0")
@@ -170,7 +170,7 @@ def test_stop_asks_all_runs_to_save(
     assert runner.run(pool) == STOPPED
     assert pool.stopped and pool.started == ([] if cause == "time limit" else ["gve-0", "have-0"])
     assert not pool.running and not runner.failed
-    assert "the same command goes on" in capsys.readouterr().out
+    assert "the same command resumes" in capsys.readouterr().out
     assert signal.getsignal(signal.SIGTERM) == before
 
 
@@ -187,4 +187,4 @@ def test_wrong_command_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert main(["run", str(tmp_path / "gone.yml")]) == FAILED and "gone.yml" in capsys.readouterr().err
     make_grid(tmp_path)
     arguments = ["run", str(tmp_path / "mine.yml"), "--results", str(tmp_path / "results")]
-    assert main([*arguments, "--only", "lve"]) == FAILED and "mine has no 'lve'" in capsys.readouterr().err
+    assert main([*arguments, "--only", "lve"]) == FAILED and "--only: unknown name 'lve'" in capsys.readouterr().err

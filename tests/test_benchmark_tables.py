@@ -23,9 +23,10 @@ from benchmark_results import (
 )
 from matplotlib.figure import Figure
 
-from sb3_have.benchmark import breakdown, tables
+from sb3_have.benchmark import tables
 from sb3_have.benchmark.reading import DISTANCE, RETURN, Results
 from sb3_have.benchmark.report import write_report
+from sb3_have.evaluation.evaluation import markdown_table
 
 
 @pytest.fixture
@@ -98,7 +99,7 @@ def test_driver_without_all_weathers_has_no_total(tmp_path: Path) -> None:
 def test_drivers_are_told_beside_the_methods(tmp_path: Path) -> None:
     drivers = [{"driver": "IDM", "weather": weather, **moments(2134)} for weather in (NOON, NIGHT)]
     report = write_report(write(tmp_path / "a", final=final(), drivers=drivers)).read_text()
-    assert "- Drivers that did not learn: `IDM` 2134 m.\n" in report
+    assert "- Untrained drivers: `IDM` 2134 m.\n" in report
 
 
 def test_newest_complete_step_counts(tmp_path: Path) -> None:
@@ -177,7 +178,7 @@ def test_no_interval_from_so_few_seeds(tmp_path: Path, seeds: int) -> None:
     text = tables.score_markdown(table, DISTANCE, "have").splitlines()
     assert [part.strip() for part in text[3].split("|")[1:-1]] == ["lve", str(seeds), "170", "0.50"]
     report = write_report(tmp_path, tmp_path / "out").read_text()
-    assert "lve: fewer than 3 seeds, hence no interval" in report and "not known for want of seeds for `lve`" in report
+    assert "lve: fewer than 3 seeds, hence no interval" in report and "unknown for lack of seeds for `lve`" in report
 
 
 def test_minutes_are_those_of_an_ordinary_run(tmp_path: Path) -> None:
@@ -199,7 +200,7 @@ def test_failures_by_hand(tmp_path: Path) -> None:
     # returns 5 -> 1 and 15 -> 6; lve's 5 -> 1 and -1 -> -3
     given = {"have": {0: (100.0, 60.0), 1: (200.0, 110.0)}, "lve": {0: (100.0, 60.0), 1: (40.0, 20.0)}}
     results = read(tmp_path, final=final(), failures=failure_rows(given))
-    table = breakdown.failure_table(results)
+    table = tables.failure_table(results)
     assert list(named(table)) == [(m, case) for m in ("lve", "have") for case in ("none none", "rgb black")]
     sound, have, lve = (named(table)[k] for k in (("have", "none none"), ("have", "rgb black"), ("lve", "rgb black")))
     assert (sound["return_mean"], sound["distance_mean"], sound["distance_kept"], sound["seeds"]) == (10, 150, 1, 2)
@@ -221,7 +222,7 @@ def test_frozen_that_is_black_counts_once(tmp_path: Path) -> None:
     rows += [row | {"kind": "frozen"} for row in rows if row["kind"] == "black"]
     rows[-1] |= moments(75, 1)  # of rgb
     results = read(tmp_path, final=final(), failures=rows)
-    table = breakdown.failure_table(results)
+    table = tables.failure_table(results)
     assert [case for method, case in named(table) if method == "have"] == [
         *("none none", "event black = frozen", "rgb black", "rgb frozen"),
     ]
@@ -232,4 +233,4 @@ def test_frozen_that_is_black_counts_once(tmp_path: Path) -> None:
 
 
 def test_markdown_escapes_and_lines_up() -> None:
-    assert tables.markdown(["a|b", "c"], [["1", "long"]]) == "| a\\|b | c    |\n|------|------|\n| 1    | long |"
+    assert markdown_table(["a|b", "c"], [["1", "long"]]) == "| a\\|b | c    |\n|------|------|\n| 1    | long |"

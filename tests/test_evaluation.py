@@ -17,12 +17,10 @@ from stable_baselines3.common.vec_env import (
     SubprocVecEnv,
     VecEnv,
     VecFrameStack,
-    VecNormalize,
     VecTransposeImage,
 )
 
 from sb3_have.envs.drivers import KeepStraightDriver, RandomDriver
-from sb3_have.evaluation.episodes import match_observations
 from sb3_have.evaluation.evaluation import evaluate, evaluate_episodes, format_table
 
 WEATHERS = ("slow", "fast")
@@ -195,15 +193,6 @@ def test_wrong_spaces_are_explained() -> None:
     only_rgb = Watcher(gym.spaces.Dict({"rgb": fake_vec_env().observation_space["rgb"]}))  # type: ignore[index]
     with pytest.raises(ValueError, match="depth: the model has None"):
         evaluate(only_rgb, ENV_ID, ["slow"], n_episodes=1)
-
-
-def test_normalized_observations_are_refused() -> None:
-    class Normalized(Watcher):
-        def get_vec_normalize_env(self) -> VecNormalize:
-            return VecNormalize(fake_vec_env(), norm_obs_keys=[])
-
-    with pytest.raises(ValueError, match="VecNormalize"):
-        match_observations(fake_vec_env(), Normalized(fake_vec_env().observation_space))
 
 
 @pytest.mark.parametrize("bad", [{"n_episodes": 0}, {"n_envs": 0}, {"weathers": ()}])

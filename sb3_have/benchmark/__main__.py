@@ -1,4 +1,4 @@
-"""``python -m sb3_have.benchmark run GRID.yml`` and ``... report FOLDER``; each knows ``--help``."""
+"""``python -m sb3_have.benchmark run GRID.yml`` and ``... report FOLDER``; both have ``--help``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ COMMANDS = {"run": "sb3_have.benchmark.runner", "report": "sb3_have.benchmark.re
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Hand over to a command; it alone is imported, so that a report needs nothing that only runs need."""
+    """Call a command, whose module alone is imported: a report does without Ray and pydantic."""
     arguments = sys.argv[1:] if arguments is None else arguments
     if not arguments or arguments[0] not in COMMANDS:
         print(f"usage: python -m sb3_have.benchmark {{{','.join(COMMANDS)}}} ...\n{__doc__}", file=sys.stderr)
