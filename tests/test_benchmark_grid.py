@@ -31,14 +31,14 @@ def test_order_is_seed_by_seed(tmp_path: Path) -> None:
         grid.jobs(only=["lve"])
 
 
-def test_method_wins_in_its_policy_kwargs_and_the_grid_elsewhere() -> None:
+def test_hyperparams_of_the_grid_override_those_of_a_method() -> None:
     env_kwargs = {"modalities": ["rgb"], "image_size": 64}
     own = {"gamma": 0.9, "n_timesteps": 5, "env_kwargs": env_kwargs, "policy_kwargs": {"net_arch": [8]}}
     given = {
         "gamma": 0.98,
         "tau": 0.1,
         "env_kwargs": {"image_size": 32, "vehicles_count": 3},
-        "policy_kwargs": {"net_arch": [16], "precision": "bfloat16"},
+        "policy_kwargs": {"net_arch": [8], "precision": "bfloat16"},
         "replay_buffer_kwargs": {"n_stack": 2},
     }
     assert merge(own, given) == {
@@ -49,6 +49,8 @@ def test_method_wins_in_its_policy_kwargs_and_the_grid_elsewhere() -> None:
         "replay_buffer_kwargs": {"n_stack": 2},
     }
     assert merge({"gamma": 0.9}, {}) == {"gamma": 0.9}, "no empty mappings, which would appear in the settings"
+    with pytest.raises(GridError, match=r"policy_kwargs\.net_arch is part of a method, which has \[8\]"):
+        merge(own, {"policy_kwargs": {"net_arch": [16]}})
 
 
 def test_settings_are_those_of_a_plain_run(tmp_path: Path) -> None:
@@ -79,19 +81,9 @@ def test_method_may_be_a_file(tmp_path: Path) -> None:
     assert job.name == "wide-0" and job.config["gamma"] == 0.5
 
 
-def test_policy_kwargs_that_do_not_reach_a_method(tmp_path: Path) -> None:
-    given = {"policy_kwargs": {"net_arch": [8], "precision": "float32"}}
-    grid = read_grid(write(tmp_path, methods=["gve-wide", "have"], hyperparams=given))
-    own = {"pi": [256, 256], "qf": [454, 454]}
-    assert grid.overruled() == [f"gve-wide keeps its own policy_kwargs.net_arch: {own}, not [8]"]
-    with pytest.raises(GridError, match=r"policy_kwargs\.net_arch: \[8\] has no effect"):
-        read_grid(write(tmp_path, methods=["gve-wide"], hyperparams=given))
-
-
 def test_image_size_of_the_grid_reaches_every_method(tmp_path: Path) -> None:
     given = {"env_kwargs": {"image_size": 32}}
     grid = read_grid(write(tmp_path, methods=["rgb", "have"], hyperparams=given))
-    assert grid.overruled() == []
     reached = [(job.config["env_kwargs"]["image_size"], job.config["env_kwargs"]["modalities"]) for job in grid.jobs()]
     assert reached[:2] == [(32, ["rgb"]), (32, ["rgb", "event"])]
 
@@ -127,6 +119,10 @@ def test_image_size_of_the_grid_reaches_every_method(tmp_path: Path) -> None:
             {"failures": {"kinds": ["black"], "severity": 4}},
             "failures.severity: Input should be less than or",
         ),
+        (
+            {"methods": ["gve-wide"], "hyperparams": {"policy_kwargs": {"net_arch": [8]}}},
+            "net_arch is part of a method",
+        ),
         ({"failures": {"kinds": ["black"], "episodes": 11}}, "failures.episodes: 11 is more than final_episodes, 10"),
     ],
 )
@@ -157,7 +153,7 @@ def test_values_are_read(tmp_path: Path) -> None:
 def test_shipped_grid(path: Path) -> None:
     grid = read_grid(path)
     assert grid.steps >= 30_000 and len(grid.seeds) >= 3
-    assert grid.weathers == WEATHERS and grid.overruled() == []
+    assert grid.weathers == WEATHERS
     # A search uses other episodes than the tables
     assert (path.parent.name == "search") == (grid.final_seed != FINAL_SEED)
 

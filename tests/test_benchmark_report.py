@@ -1,4 +1,4 @@
-"""The benchmark's report: what there is, what is missing, and files that cannot be read."""
+"""The report of a benchmark: its sections, missing runs, and files that cannot be read."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from sb3_have.benchmark.report import main, write_report
 
 @pytest.fixture
 def words_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures are not drawn, which takes most of a report's time."""
+    """Skip drawing, which takes most of a report's time."""
     monkeypatch.setattr(Figure, "savefig", lambda figure, path, **kwargs: Path(path).touch())
 
 
 def cells(report: str, first: str) -> list[str]:
-    """Of the first line of the tables of a report that begins so."""
+    """The cells of the first line of a table that begins with this word."""
     (found, *_) = [line for line in report.splitlines() if line.startswith(f"| {first} ")]
     return [text.strip() for text in found.strip("|").split("|")]
 
@@ -42,7 +42,7 @@ def cells(report: str, first: str) -> list[str]:
 
 
 @pytest.mark.usefixtures("words_only")
-def test_report_says_what_is_missing(tmp_path: Path) -> None:
+def test_missing_runs_without_a_grid(tmp_path: Path) -> None:
     partial: Runs = {"lve": {0: (100,)}, **DISTANCES}
     begun = evaluations({"gve-wide": {1: (10, 20)}}, {1000: 1.0})
     write(tmp_path / "core", final=final(partial), evaluations=[*evaluations(), *begun])
@@ -55,7 +55,7 @@ def test_report_says_what_is_missing(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("words_only")
-def test_grid_tells_what_there_is_to_be(tmp_path: Path) -> None:
+def test_missing_runs_of_a_grid(tmp_path: Path) -> None:
     folder = write(tmp_path / "results" / "core", final=final())
     assert "Every method has every seed." in write_report(folder).read_text()
     (tmp_path / "grids").mkdir()
@@ -94,7 +94,7 @@ def test_report_without_the_reference(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("words_only")
-def test_runs_of_different_length_are_told(tmp_path: Path) -> None:
+def test_runs_of_different_lengths(tmp_path: Path) -> None:
     write(tmp_path / "a", final=final({"sac": DISTANCES["sac"]}))
     write(tmp_path / "b", final=final({"have": DISTANCES["have"]}, step=90_000))
     report = write_report([tmp_path / "a", tmp_path / "b"], tmp_path / "out").read_text()
@@ -104,7 +104,7 @@ def test_runs_of_different_length_are_told(tmp_path: Path) -> None:
 # The report
 
 
-def test_report_and_all_that_it_shows(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_whole_report(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     ends = {"return": 8.0, "distance": 70.0, "steps": 20, "crashed": True, "offroad": False}
     episodes = [{"method": "have", "seed": 0, "weather": NIGHT, "episode_seed": i, **ends} for i in range(3)]
     episodes.append({**episodes[0], "episode_seed": 9, "steps": 60, "crashed": False})
@@ -136,7 +136,7 @@ def test_report_and_all_that_it_shows(tmp_path: Path, capsys: pytest.CaptureFixt
 
 
 @pytest.mark.usefixtures("words_only")
-def test_weathers_that_others_win_are_told(tmp_path: Path) -> None:
+def test_weathers_that_others_win(tmp_path: Path) -> None:
     runs = {"have": {0: (150, 100)}, "sac": {0: (100, 200)}}
     report = write_report(write(tmp_path / "a", final=final(runs))).read_text()
     assert f"`have` is first in distance in 1 of 2 weathers; not in {NIGHT} (`sac`)." in report
@@ -165,7 +165,7 @@ def test_intervals_in_words(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("words_only")
 def test_noise_of_the_learning_curves_in_words(tmp_path: Path) -> None:
-    """Two weathers with two final episodes each, of standard deviation 30 m (ddof 0) as ever here."""
+    """Two weathers with two final episodes each, whose standard deviation is 30 m (ddof 0)."""
     one_each = [row | {"episodes": 1} for row in evaluations(shares={1000: 0.5})]
     report = write_report(write(tmp_path / "a", final=final(), evaluations=one_each)).read_text()
     assert "A seed's point of 2 episodes has a standard error of ±30 m in distance and ±3.0 in return" in report

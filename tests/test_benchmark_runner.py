@@ -1,4 +1,4 @@
-"""Runs of a benchmark side by side: in order, none twice, none lost, and all told to stop."""
+"""Runs of a benchmark side by side: in order, none twice, none lost, and all stopped on request."""
 
 import os
 import signal
@@ -24,7 +24,7 @@ from sb3_have.train import Run, algorithms
 
 @pytest.fixture
 def unexamined(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For runs that only pretend: their results are of no interest."""
+    """Ignore the results of runs that do nothing."""
     numbers = {"return_mean": [1.0], "distance_mean": [1.0]}
     tables = {"final": pd.DataFrame(numbers), "runs": pd.DataFrame({"minutes": [1.0]})}
     monkeypatch.setattr(runner_module, "collect", lambda job, folder: tables)
@@ -42,7 +42,7 @@ def test_results_of_a_grid(tmp_path: Path) -> None:
     assert list(zip(final["method"], final["seed"], strict=True)) == [run for run in of_runs for _ in range(2)]
     assert list(final["weather"]) == ["slow", "fast"] * 4
     assert (final["step"] == 30).all() and (final["episodes"] == 3).all()
-    # each drives the same episodes, and the statistics are theirs
+    # Every run has the same episodes, and the statistics are theirs
     seeds = episodes.groupby(["method", "seed"])["episode_seed"].agg(tuple)
     assert len(set(seeds)) == 1 and len(set(seeds.iloc[0])) == 6
     grouped = episodes.groupby(["method", "seed", "weather"], sort=False)
@@ -53,7 +53,7 @@ def test_results_of_a_grid(tmp_path: Path) -> None:
 
     curve = read(results, "evaluations")
     assert list(curve["step"].unique()) == [10, 20, 30]
-    assert list(curve["episodes"].unique()) == [1, 3], "of the last step there is the final evaluation alone"
+    assert list(curve["episodes"].unique()) == [1, 3], "the last point is the final evaluation"
     assert len(curve) == 4 * 2 * 3
 
     weights = read(results, "weights")
@@ -93,7 +93,7 @@ def test_results_of_a_grid(tmp_path: Path) -> None:
     assert table["parameters"][0] == everything - of_target > 0
     assert not [*runs.glob("*/checkpoint*")] and len([*runs.glob("*/model.zip")]) == 4
 
-    # and again: nothing is left to do
+    # Nothing is left to do for a second runner
     before = contents(results)
     again = Runner(grid.jobs(), runs, results)
     assert again.is_done and again.run(LocalPool(lambda job: pytest.fail("it was finished"))) == FINISHED
@@ -102,7 +102,7 @@ def test_results_of_a_grid(tmp_path: Path) -> None:
     assert contents(results).keys() == before.keys()
     for name in before:
         lines, lines_before = (sorted(text.splitlines()) for text in (contents(results)[name], before[name]))
-        assert lines == lines_before, "a run's rows take the place of those it had"
+        assert lines == lines_before, "a run's rows replace its old ones"
 
 
 def test_work_goes_seed_by_seed_on_all_workers(tmp_path: Path, unexamined: None) -> None:
@@ -112,7 +112,7 @@ def test_work_goes_seed_by_seed_on_all_workers(tmp_path: Path, unexamined: None)
     assert pool.started == [job.name for job in jobs] and pool.most == 3
 
 
-def test_run_that_dies_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_run_that_dies_resumes_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     grid, runs, results = make_grid(tmp_path, seeds=[0]), tmp_path / "runs", tmp_path / "results"
     began: list[tuple[str, int]] = []
     learn = Run._learn
@@ -128,11 +128,11 @@ def test_run_that_dies_goes_on_from_its_checkpoint(tmp_path: Path, monkeypatch: 
     assert Runner(grid.jobs(), runs, results).run(LocalPool(lambda job: run_job(job, runs))) == FINISHED
     assert began == [("gve-0", 0), ("gve-0", 20), ("have-0", 0)]
     curve = read(results, "evaluations").query("method == 'gve'")
-    assert list(curve["step"]) == [10, 10, 20, 20, 30, 30], "no evaluation is there twice"
+    assert list(curve["step"]) == [10, 10, 20, 20, 30, 30], "no evaluation is repeated"
     assert not (runs / "gve-0" / "traceback.txt").exists()
 
 
-def test_run_that_dies_again_is_left_and_told(
+def test_run_that_keeps_failing_is_given_up(
     tmp_path: Path, unexamined: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def work(job: Job) -> bool:
@@ -149,7 +149,7 @@ def test_run_that_dies_again_is_left_and_told(
     assert "out of luck" in path.read_text()
 
 
-def test_run_that_others_stop_is_told(tmp_path: Path, unexamined: None) -> None:
+def test_run_that_is_stopped_from_outside(tmp_path: Path, unexamined: None) -> None:
     runner = Runner(make_grid(tmp_path).jobs()[:1], tmp_path / "runs", tmp_path, retries=1)
     assert runner.run(LocalPool(lambda job: False)) == FAILED
     assert "stopped from outside" in (tmp_path / "runs" / "gve-0" / "traceback.txt").read_text()
@@ -174,7 +174,7 @@ def test_stop_asks_all_runs_to_save(
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_missing_ray_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     make_grid(tmp_path)
     where = ["--runs", str(tmp_path / "runs"), "--results", str(tmp_path / "results")]

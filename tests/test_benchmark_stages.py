@@ -55,7 +55,7 @@ def test_stages_resume_where_they_were(tmp_path: Path, monkeypatch: pytest.Monke
 
 
 def test_stages_do_not_depend_on_the_number_of_environments(tmp_path: Path) -> None:
-    """A model sees other observations under each failure, and its actions are in the return."""
+    """The returns depend on the actions, which differ under each failure."""
     files = {}
     for eval_envs in (1, 5):
         job = make_grid(tmp_path, failures=FAILURES, eval_envs=eval_envs).jobs()[1]
@@ -72,7 +72,7 @@ def test_stages_do_not_depend_on_the_number_of_environments(tmp_path: Path) -> N
     assert files[1]["failures"]["return_mean"].nunique() == 8
 
 
-def test_failures_may_be_asked_for_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_failures_may_be_added_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     runs, results = tmp_path / "runs", tmp_path / "results"
     job = make_grid(tmp_path).jobs()[0]
     assert run_job(job, runs)
@@ -81,14 +81,14 @@ def test_failures_may_be_asked_for_later(tmp_path: Path, monkeypatch: pytest.Mon
 
     later = make_grid(tmp_path, failures=FAILURES).jobs()[0]
     assert not is_finished(results, later)
-    monkeypatch.setattr(Run, "train", lambda *args: pytest.fail("it is trained"))
+    monkeypatch.setattr(Run, "train", lambda *args: pytest.fail("the model is trained already"))
     assert run_job(later, runs)
     merge(results, later, collect(later, runs / job.name))
     assert is_finished(results, later) and is_finished(results, job)
     assert len(read(results, "failures")) == 8
 
 
-def test_run_begun_by_train_is_taken_up(tmp_path: Path) -> None:
+def test_run_begun_by_train_is_resumed(tmp_path: Path) -> None:
     job = make_grid(tmp_path, save_freq=0).jobs()[0]
     config = {**TINY, "value_estimation": "gve", "n_timesteps": 7}
     options: dict[str, Any] = {"eval_freq": 10, "eval_episodes": 1, "weathers": ("slow", "fast"), "save_freq": 0}
@@ -115,7 +115,7 @@ def test_checkpoint_stays_only_if_asked_for(tmp_path: Path) -> None:
         run_job(make_grid(tmp_path, steps=50).jobs()[0], tmp_path)
 
 
-def test_training_past_the_grid_is_not_driven(tmp_path: Path) -> None:
+def test_training_past_the_grid_is_refused(tmp_path: Path) -> None:
     job = make_grid(tmp_path).jobs()[0]
     run = Run(job.config, ENV_ID, tmp_path / job.name, eval_freq=0)
     run.train(31)
@@ -124,8 +124,8 @@ def test_training_past_the_grid_is_not_driven(tmp_path: Path) -> None:
     assert not (tmp_path / job.name / "final-30").exists()
 
 
-def test_training_that_ends_a_rollout_late_is_driven(tmp_path: Path) -> None:
-    """As when it was stopped at an odd step, with an update every second one."""
+def test_training_may_end_a_rollout_late(tmp_path: Path) -> None:
+    """As after a stop at an odd step, with an update every second step."""
     job = make_grid(tmp_path, {"train_freq": 2}).jobs()[0]
     run = Run(job.config, ENV_ID, tmp_path / job.name, eval_freq=0)
     run.train(1)  # two steps, as rollouts are whole
@@ -144,7 +144,7 @@ def test_stop_in_the_last_evaluation_is_a_stop(tmp_path: Path, monkeypatch: pyte
 
 
 def test_parameters_are_those_that_are_trained() -> None:
-    """A policy has DeepMDP's heads in any case; where that loss is off, they get no gradient."""
+    """DeepMDP's heads count only if that loss is on."""
     kwargs: dict[str, Any] = {"policy_kwargs": TINY["policy_kwargs"], "buffer_size": 10}
     sac, deepmdp = (HAVESAC("MultiInputPolicy", gym.make(ENV_ID), auxiliary=a, **kwargs) for a in (None, "deepmdp"))
     heads = sum(parameter.numel() for parameter in sac.policy.auxiliary.parameters())
@@ -154,7 +154,7 @@ def test_parameters_are_those_that_are_trained() -> None:
 
 
 def test_final_seed_of_a_grid(tmp_path: Path) -> None:
-    """A search drives other episodes than the tables, and its runs are not taken for theirs."""
+    """A search has other episodes than the tables, and its runs are not mistaken for theirs."""
     ours, theirs = make_grid(tmp_path, final_seed=7).jobs()[0], make_grid(tmp_path).jobs()[0]
     run_job(ours, tmp_path / "runs")
     episodes = pd.read_csv(tmp_path / "runs" / ours.name / "final-30" / "episodes.csv")

@@ -1,4 +1,4 @@
-"""Tables of a benchmark: worked out by hand."""
+"""Tables of a benchmark, against values computed by hand."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def results(tmp_path: Path) -> Results:
 
 @pytest.fixture
 def words_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures are not drawn, which takes most of a report's time."""
+    """Skip drawing, which takes most of a report's time."""
     monkeypatch.setattr(Figure, "savefig", lambda figure, path, **kwargs: Path(path).touch())
 
 
@@ -96,7 +96,7 @@ def test_driver_without_all_weathers_has_no_total(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("words_only")
-def test_drivers_are_told_beside_the_methods(tmp_path: Path) -> None:
+def test_drivers_are_reported_beside_the_methods(tmp_path: Path) -> None:
     drivers = [{"driver": "IDM", "weather": weather, **moments(2134)} for weather in (NOON, NIGHT)]
     report = write_report(write(tmp_path / "a", final=final(), drivers=drivers)).read_text()
     assert "- Untrained drivers: `IDM` 2134 m.\n" in report
@@ -113,8 +113,8 @@ def test_newest_complete_step_counts(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("words_only")
 def test_environment_without_distance(tmp_path: Path) -> None:
-    untold = {"distance_mean": None, "distance_std": None}
-    results = read(tmp_path, final=[row | untold for row in final()], evaluations=[r | untold for r in evaluations()])
+    unknown = {"distance_mean": None, "distance_std": None}
+    results = read(tmp_path, final=[row | unknown for row in final()], evaluations=[r | unknown for r in evaluations()])
     assert results.measures == [RETURN]
     report = write_report(tmp_path, tmp_path / "out").read_text()
     assert "D [m]" not in report and "IQM of return" in report and not re.search(r"\bnan\b", report)
@@ -143,7 +143,7 @@ def test_statistics_by_hand(results: Results) -> None:
 
 
 def test_areas_by_hand(tmp_path: Path) -> None:
-    """A run that is not finished, and steps that only one run was evaluated at, are left out."""
+    """Unfinished runs are left out, and steps at which only one run was evaluated."""
     rows = evaluations(shares={1000: 0.5, 2000: 1.0})
     rows += final({"have": {0: (9000.0, 9000.0)}}, step=1500) + final({"have": {2: (9000.0, 9000.0)}}, step=1000)
     results = read(tmp_path, final=final(), evaluations=rows)
@@ -156,7 +156,7 @@ def test_areas_by_hand(tmp_path: Path) -> None:
 
 
 def test_intervals_draw_whole_seeds(tmp_path: Path) -> None:
-    """With single scores drawn, no interval of have's would reach from one seed's mean to another's."""
+    """With single scores, no interval would reach from the lowest seed's mean to the highest one's."""
     runs = {"sac": {0: (100, 200), 1: (140, 160), 2: (150, 150)}, "have": {i: (200 + i, 400 + i) for i in range(3)}}
     sac, have = tables.score_table(read(tmp_path, final=final(runs))).tail(2).to_dict("records")
     assert (have["iqm_lower"], have["iqm_upper"]) == (300, 302)
@@ -182,7 +182,7 @@ def test_no_interval_from_so_few_seeds(tmp_path: Path, seeds: int) -> None:
 
 
 def test_minutes_are_those_of_an_ordinary_run(tmp_path: Path) -> None:
-    """A single run on a busy machine tells nothing of the others."""
+    """A single run on a busy machine does not matter."""
     runs = {"have": dict.fromkeys(range(3), (100, 200))}
     rows = [row | {"minutes": minutes} for row, minutes in zip(run_rows(runs), (15.0, 13.0, 130.0), strict=True)]
     (row,) = tables.run_table(read(tmp_path, final=final(runs), runs=rows)).to_dict("records")

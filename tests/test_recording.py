@@ -1,4 +1,4 @@
-"""Recordings: what was seen, done, got and thought at each step belongs together, in any environment."""
+"""Recordings: observations, actions, rewards and values of a step belong together, in any environment."""
 
 import pickle
 from copy import deepcopy
@@ -140,7 +140,7 @@ def test_the_global_critic_alone_has_a_value_and_no_weights() -> None:
 def test_the_wrappers_of_the_training_are_put_on_in_their_order(normalize_first: bool) -> None:
     env = DummyVecEnv([lambda: RandomSensors(vectors_space())])
     model: PPO | SAC
-    if normalize_first:  # which off-policy algorithms refuse, having to store what is not normalised
+    if normalize_first:  # off-policy algorithms refuse this order, because they store unnormalised observations
         stacked = VecFrameStack(VecNormalize(env), 3, {"a": "first", "b": "last"})
         model = PPO("MultiInputPolicy", stacked, n_steps=10, batch_size=10, n_epochs=1, seed=0, device="cpu")
     else:

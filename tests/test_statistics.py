@@ -1,4 +1,4 @@
-"""Statistics over runs: known answers, brute force, rliable's figures, and intervals that cover what they claim to."""
+"""Statistics over runs: known answers, brute force, rliable's figures, and the coverage of the intervals."""
 
 import json
 import math
@@ -51,7 +51,7 @@ def test_known_answers() -> None:
     scores = np.array([[0.0, 10.0], [1.0, 20.0], [2.0, 30.0], [9.0, 100.0]])
     assert mean(scores) == 172 / 8
     assert median(scores) == (3 + 40) / 2
-    assert iqm(scores) == (2 + 9 + 10 + 20) / 4  # without 0, 1 and 30, 100: the quarter is of all eight scores
+    assert iqm(scores) == (2 + 9 + 10 + 20) / 4  # without 0, 1 and 30, 100: a quarter of all eight scores
     assert optimality_gap(scores, target=10.0) == (10 + 9 + 8 + 1) / 8
     assert iqm([[1.0], [2.0], [6.0]]) == 3  # a quarter of three scores is none
     assert iqm([[0.0], [1.0], [2.0], [3.0], [100.0]]) == 2  # and of five, one
@@ -162,7 +162,7 @@ def test_whole_runs_are_resampled_for_all_tasks_at_once() -> None:
 
 
 def test_scores_stay_within_their_task() -> None:
-    """Nothing varies within either task, so nothing does."""
+    """Nothing varies within either task."""
     assert stratified_bootstrap(mean, [[0.0, 100.0]] * 5) == (50.0, 50.0, 50.0)
 
 
@@ -235,7 +235,7 @@ def test_few_runs_cover_as_documented(runs: int, share: float) -> None:
 
 
 def test_runs_scored_on_every_task_are_kept_whole() -> None:
-    """An agent good in one weather is good in all: its scores are no independent evidence."""
+    """An agent that is good in one weather is good in all, so its scores are not independent."""
     rng = np.random.default_rng(0)
 
     def draw() -> list[np.ndarray]:
@@ -292,7 +292,7 @@ def test_rliable_s_figures_have_ties_and_few_runs() -> None:
     assert sum(tied) >= 3 and RLIABLE["made_with"]["rliable"] == "1.2.0"
 
 
-# What is refused
+# Errors
 
 
 @pytest.mark.parametrize(
@@ -306,7 +306,7 @@ def test_rliable_s_figures_have_ties_and_few_runs() -> None:
         ([[np.inf], [1.0]], "finite, got 1 NaN"),
     ],
 )
-def test_what_is_no_table_of_scores(scores: Any, message: str) -> None:
+def test_wrong_tables_of_scores(scores: Any, message: str) -> None:
     for statistic in SINGLE:
         with pytest.raises(ValueError, match=message):
             statistic(scores)

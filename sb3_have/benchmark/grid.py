@@ -18,9 +18,9 @@ A grid is a YAML file; only ``methods`` and ``seeds`` are required::
     failures: {kinds: [black, frozen, noise], severity: 3, episodes: 1}   # default: no sensor failures
 
 ``hyperparams`` override those of every method. ``env_kwargs`` and ``policy_kwargs`` are merged key by key:
-``{env_kwargs: {image_size: 84}}`` changes nothing else. In ``policy_kwargs`` a method's own keys win, because they are
-what makes it that method. For the same reason ``modalities`` is a key of its own and not part of ``env_kwargs``: it
-changes the sensors of every method that has several, and leaves ``rgb`` its one.
+``{env_kwargs: {image_size: 84}}`` changes nothing else. They cannot change ``policy_kwargs`` that a method has itself,
+because those make it that method. For the same reason ``modalities`` is a key of its own and not part of
+``env_kwargs``: it changes the sensors of every method that has several, and leaves ``rgb`` its one.
 """
 
 from __future__ import annotations
@@ -173,7 +173,14 @@ class Grid(BaseModel):
 
     def _config(self, method: str) -> dict[str, Any]:
         """The hyper-parameters of a method, merged with the grid's."""
-        config = merge(self._own_config(method), self.hyperparams)
+        beside = self._path.parent / method
+        try:
+            own = load_config(str(beside if beside.is_file() else method), self.env)
+        except FileNotFoundError as error:
+            raise GridError(f"methods: {error}{_suggestion(method, config_names())}") from None
+        except KeyError as error:
+            raise GridError(f"methods: {error.args[0]}") from None
+        config = merge(own, self.hyperparams)
         if self.modalities and len(config.get("env_kwargs", {}).get("modalities", self.modalities)) > 1:
             config["env_kwargs"] = {**config.get("env_kwargs", {}), "modalities": [*self.modalities]}
         algo = algorithm_of(method_name(method))
@@ -183,33 +190,6 @@ class Grid(BaseModel):
         except ValueError as error:
             raise GridError(str(error)) from None
         return config
-
-    def _own_config(self, method: str) -> dict[str, Any]:
-        beside = self._path.parent / method
-        try:
-            return load_config(str(beside if beside.is_file() else method), self.env)
-        except FileNotFoundError as error:
-            raise GridError(f"methods: {error}{_suggestion(method, config_names())}") from None
-        except KeyError as error:
-            raise GridError(f"methods: {error.args[0]}") from None
-
-    def overruled(self) -> list[str]:
-        """Sentences about the grid's ``policy_kwargs`` that some methods replace by their own.
-
-        :raises GridError: If a key reaches no method at all
-        """
-        sentences = []
-        own = {method_name(m): self._own_config(m).get("policy_kwargs", {}) for m in self.methods}
-        for key, value in self.hyperparams.get("policy_kwargs", {}).items():
-            others = {name: kwargs[key] for name, kwargs in own.items() if kwargs.get(key, value) != value}
-            if len(others) == len(own):
-                raise GridError(
-                    f"hyperparams: policy_kwargs.{key}: {value!r} has no effect, every method has its own; remove it"
-                )
-            sentences += [
-                f"{name} keeps its own policy_kwargs.{key}: {other!r}, not {value!r}" for name, other in others.items()
-            ]
-        return sentences
 
 
 @dataclass(frozen=True)
@@ -244,12 +224,16 @@ class Job:
 
 
 def merge(own: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> dict[str, Any]:
-    """A method's configuration under a grid's ``hyperparams``, without ``n_timesteps``: the grid has ``steps``."""
+    """A method's configuration under a grid's ``hyperparams``, without ``n_timesteps``: the grid has ``steps``.
+
+    :raises GridError: If they change the method's own ``policy_kwargs``
+    """
     merged = {**own, **hyperparams}
-    if "env_kwargs" in merged:
-        merged["env_kwargs"] = {**own.get("env_kwargs", {}), **hyperparams.get("env_kwargs", {})}
-    if "policy_kwargs" in merged:
-        merged["policy_kwargs"] = {**hyperparams.get("policy_kwargs", {}), **own.get("policy_kwargs", {})}
+    for key in {"env_kwargs", "policy_kwargs"} & merged.keys():
+        merged[key] = {**own.get(key, {}), **hyperparams.get(key, {})}
+    for key, value in own.get("policy_kwargs", {}).items():
+        if merged["policy_kwargs"][key] != value:
+            raise GridError(f"hyperparams: policy_kwargs.{key} is part of a method, which has {value!r}; remove it")
     merged.pop("n_timesteps", None)
     return merged
 
@@ -271,7 +255,6 @@ def read_grid(path: Path) -> Grid:
         grid._path = path
         # Check the configurations of all methods
         grid.jobs()
-        grid.overruled()
     except ValidationError as errors:
         raise GridError("\n".join(f"{path}: {_in_words(error)}" for error in errors.errors())) from None
     except GridError as error:

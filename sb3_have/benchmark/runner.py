@@ -199,7 +199,6 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--only", nargs="+", default=[], metavar="METHOD", help="run these methods only")
     parser.add_argument("--time-limit", type=float, metavar="SECONDS", help="stop after this time, as on Ctrl-C")
-    parser.add_argument("--retries", type=int, default=RETRIES, help="how often to restart a run that fails")
     parser.add_argument(
         "--keep-checkpoints",
         action="store_true",
@@ -217,9 +216,9 @@ def main(arguments: list[str] | None = None) -> int:
         results = (args.results or Path("benchmarks") / "results" / grid.name).resolve()
         results.mkdir(parents=True, exist_ok=True)
         with locked(results):
-            runner = Runner(jobs, runs, results, args.retries, args.time_limit)
-            print(f"{grid.name}: {len(jobs)} runs of {grid.steps} steps, {len(runner.finished)} already finished")
-            print("".join(f"{sentence}\n" for sentence in grid.overruled()), end="", flush=True)
+            runner = Runner(jobs, runs, results, time_limit=args.time_limit)
+            done = len(runner.finished)
+            print(f"{grid.name}: {len(jobs)} runs of {grid.steps} steps, {done} already finished", flush=True)
             if runner.is_done:
                 return runner.conclude()
             pool = RayPool(runs, args.address, args.workers, args.gpus, args.keep_checkpoints)
