@@ -31,9 +31,7 @@ def test_results_of_other_settings_are_refused(tmp_path: Path) -> None:
         with pytest.raises(GridError, match="contains gve-0 with other settings") as error:
             is_finished(results, other)
         assert f"({message})" in str(error.value)
-    assert not is_finished(results, make_grid(tmp_path, config={"gamma": 0.5}).jobs()[1]), (
-        "another run, which is missing"
-    )
+    assert not is_finished(results, make_grid(tmp_path, config={"gamma": 0.5}).jobs()[1]), "another run"
     changed = make_grid(tmp_path, config={"gamma": 0.5}).jobs()[0]
     with pytest.raises(ValueError, match="other settings"):
         run_job(changed, runs)

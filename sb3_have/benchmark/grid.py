@@ -251,7 +251,7 @@ def read_grid(path: Path) -> Grid:
     if not isinstance(given, dict):
         raise GridError(f"{path}: expected keys and values such as 'steps: 30000', got {given!r}")
     try:
-        grid = Grid(**given)
+        grid = Grid.model_validate(given)
         grid._path = path
         # Check the configurations of all methods
         grid.jobs()
