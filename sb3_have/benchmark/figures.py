@@ -57,12 +57,12 @@ SPARE = tuple(Style(colour, "-.", "x", "xxx") for colour in ("#0072B2", "#D55E00
 
 
 def style(method: str) -> Style:
-    """The style of a method; an unknown one gets a spare style that depends only on its name."""
+    """Return the style of a method; an unknown one gets a spare style that depends only on its name."""
     return STYLES.get(method) or SPARE[sum(map(ord, method)) % len(SPARE)]
 
 
 def plot_progress(results: Results, reference: str = "have") -> Figure:
-    """Mean over weathers against training steps: a row of panels for every few methods, a column for each measure.
+    """Plot the mean over weathers against training steps, with a column for each measure.
 
     A line is the mean over seeds. The reference alone has a band, from its lowest to its highest seed. Only the seeds
     that are as far as their method's furthest one are used: a mean over different seeds at different steps would jump
@@ -101,7 +101,7 @@ def plot_progress(results: Results, reference: str = "have") -> Figure:
 
 
 def learning_curves(evaluations: pd.DataFrame, method: str) -> pd.DataFrame:
-    """The learning curve of each seed that is as far as the method's furthest one.
+    """Return the learning curve of each seed that is as far as the method's furthest one.
 
     :param evaluations: Evaluations of all methods
     :param method: The method
@@ -132,7 +132,7 @@ def _draw_drivers(axis: Axes, drivers: pd.DataFrame, measure: Measure) -> None:
 
 
 def plot_scores(results: Results, reference: str = "have", table: pd.DataFrame | None = None) -> Figure:
-    """Interquartile mean of each method over seeds and weathers, with its 95% interval if there are enough seeds.
+    """Plot the interquartile mean of each method, with its 95% interval if there are enough seeds.
 
     :param results: Results with finished runs
     :param reference: As for :func:`~sb3_have.benchmark.tables.score_table`
@@ -143,7 +143,7 @@ def plot_scores(results: Results, reference: str = "have", table: pd.DataFrame |
 
 
 def plot_improvement(results: Results, reference: str = "have", table: pd.DataFrame | None = None) -> Figure:
-    """How often a run of the reference beats one of each other method in the same weather; parameters as above.
+    """Plot how often the reference beats each other method in the same weather; parameters as for :func:`plot_scores`.
 
     :raises ValueError: If the reference or all other methods have no finished run
     """
@@ -183,7 +183,7 @@ def _plot_intervals(results: Results, table: pd.DataFrame, name: str, methods: l
 
 
 def plot_profiles(results: Results, measure: Measure = DISTANCE, reference: str = "have") -> Figure:
-    """Share of runs, over all weathers, whose mean exceeds a threshold: the higher the line, the better.
+    """Plot the share of runs, over all weathers, whose mean exceeds a threshold: the higher the line, the better.
 
     :param results: Results with finished runs
     :param measure: Measure of the thresholds
@@ -225,14 +225,14 @@ def plot_profiles(results: Results, measure: Measure = DISTANCE, reference: str 
 
 
 def plot_weather_weights(results: Results) -> Figure:
-    """Mean weight of each modality by weather: a row for each method; whiskers from the lowest to the highest seed."""
+    """Plot the mean weight of each modality by weather; see :func:`sb3_have.plotting.plot_weather_weights`."""
     weights = results["weights"]
     weathers = [weather for weather in results.weathers if weather in set(weights["weather"])]
     return weather_figures.plot_weather_weights(weights, weathers or None, ordered(set(weights["method"])))
 
 
 def plot_episode_weights(results: Results, method: str, seed: int) -> Figure:
-    """Weight of each modality over one episode of each weather (the paper's Fig. 5).
+    """Plot the weight of each modality over one episode of each weather (the paper's Fig. 5).
 
     :param results: The results
     :param method: Method with weights
@@ -272,8 +272,10 @@ def plot_episode_weights(results: Results, method: str, seed: int) -> Figure:
 
 
 def plot_failures(table: pd.DataFrame, measure: Measure) -> Figure:
-    """Every method under each sensor failure: a row for each modality, with a group of bars without a failure and one
-    for each kind of failure; whiskers from the lowest to the highest seed.
+    """Plot every method under each sensor failure.
+
+    Each modality has a row, with a group of bars without a failure and one for each kind of failure. Whiskers reach
+    from the lowest to the highest seed.
 
     :param table: From :func:`~sb3_have.benchmark.tables.failure_table`
     :param measure: Measure of the bars

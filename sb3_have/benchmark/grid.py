@@ -158,7 +158,7 @@ class Grid(BaseModel):
         return self
 
     def jobs(self, only: Iterable[str] = ()) -> list[Job]:
-        """The runs in the order of work.
+        """Return the runs in the order of work.
 
         :param only: Methods to keep; all if empty
         :raises GridError: If the grid lacks one of ``only``, or a method's configuration does not fit
@@ -172,7 +172,7 @@ class Grid(BaseModel):
         return [Job(self, name, seed, algorithm_of(name), configs[name]) for seed in self.seeds for name in kept]
 
     def _config(self, method: str) -> dict[str, Any]:
-        """The hyper-parameters of a method, merged with the grid's."""
+        """Return the hyper-parameters of a method, merged with the grid's."""
         beside = self._path.parent / method
         try:
             own = load_config(str(beside if beside.is_file() else method), self.env)
@@ -224,7 +224,7 @@ class Job:
 
 
 def merge(own: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> dict[str, Any]:
-    """A method's configuration under a grid's ``hyperparams``, without ``n_timesteps``: the grid has ``steps``.
+    """Merge a method's configuration with a grid's ``hyperparams``. ``n_timesteps`` is dropped: the grid has ``steps``.
 
     :raises GridError: If they change the method's own ``policy_kwargs``
     """
@@ -263,7 +263,7 @@ def read_grid(path: Path) -> Grid:
 
 
 def _in_words(error: Any) -> str:
-    """A validation error of pydantic, with its key, its value and the remedy."""
+    """Describe a validation error of pydantic by its key, its value and the remedy."""
     key, kind = ".".join(map(str, error["loc"])), error["type"]
     if kind == "extra_forbidden":
         fields = Failures.model_fields if len(error["loc"]) > 1 else Grid.model_fields
@@ -275,7 +275,7 @@ def _in_words(error: Any) -> str:
 
 
 def _known(names: Iterable[str], known: Iterable[str], prefix: str = "") -> tuple[str, ...]:
-    """The names, if all of them are known."""
+    """Return the names, or raise an error if one is unknown."""
     names, known = tuple(names), set(known)
     if unknown := [name for name in names if name not in known]:
         raise ValueError(f"{prefix}unknown name {unknown[0]!r}{_suggestion(unknown[0], known)}")
@@ -283,14 +283,14 @@ def _known(names: Iterable[str], known: Iterable[str], prefix: str = "") -> tupl
 
 
 def _suggestion(word: str, known: Iterable[str]) -> str:
-    """The word that was probably meant; all of them if none is similar."""
+    """Suggest the word that was probably meant, or all of them if none is similar."""
     known = sorted(known)
     similar = get_close_matches(word, known, n=1)
     return f"; did you mean {similar[0]!r}?" if similar else f"; choose from {', '.join(known)}"
 
 
 def _refuse_numbers_as_text(values: Mapping[str, Any]) -> None:
-    """YAML reads 1e-3 as text, with which a run would fail in the middle of its first update."""
+    """Refuse numbers such as 1e-3, which YAML reads as text: a run would fail in its first update."""
     for key, value in values.items():
         if isinstance(value, dict):
             _refuse_numbers_as_text(value)

@@ -103,7 +103,7 @@ class RayPool:
 
 
 def _work(job: Job, runs: Path, device: str, keep_checkpoint: bool) -> bool:
-    """A run in its process. Its output goes to ``output.txt`` in its folder."""
+    """Work on a run in its process. The output goes to ``output.txt`` in its folder."""
     import torch as th
 
     from sb3_have.benchmark.stages import run_job

@@ -22,7 +22,7 @@ PACKAGES = ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "highway-e
 
 
 def commit_of(folder: Path) -> str | None:
-    """The commit of a git checkout, with "-dirty" if tracked files differ from it; None if it is not a checkout.
+    """Return the commit of a git checkout, with "-dirty" if tracked files differ from it; None if it is not a checkout.
 
     :param folder: Top of the checkout
     """
@@ -40,7 +40,7 @@ COMMIT = commit_of(Path(__file__).resolve().parents[2])
 
 
 def machine(device: str = "cpu") -> dict[str, str]:
-    """The machine and the versions, as columns of a row.
+    """Return the machine and the versions, as columns of a row.
 
     :param device: Torch device
     :return: ``machine`` and ``versions``, the latter with the package's commit if it is a checkout
@@ -56,7 +56,7 @@ def machine(device: str = "cpu") -> dict[str, str]:
 
 
 def cpu_model() -> str:
-    """Name of the processor, if the system has it."""
+    """Return the name of the processor, if the system has it."""
     info = Path("/proc/cpuinfo")
     for line in info.read_text().splitlines() if info.exists() else []:
         if line.startswith("model name"):
@@ -65,7 +65,7 @@ def cpu_model() -> str:
 
 
 def provenance(results: Results, out: Path) -> list[str]:
-    """The parts of a report's last section: machines, versions, settings, and the commands that reproduce it.
+    """Write a report's last section: machines, versions, settings, and the commands that reproduce it.
 
     :param results: The results
     :param out: Folder of the report
@@ -87,7 +87,7 @@ def provenance(results: Results, out: Path) -> list[str]:
 
 
 def _settings(runs: pd.DataFrame) -> list[str]:
-    """The settings that all runs share, and the others by method."""
+    """List the settings that all runs share, and the others by method."""
     of_runs = [flatten(json.loads(text)) for text in runs["settings"]]
     keys = list(dict.fromkeys(key for settings in of_runs for key in settings))
     same = [key for key in keys if all(key in s and s[key] == of_runs[0][key] for s in of_runs)]
@@ -106,7 +106,7 @@ def _settings(runs: pd.DataFrame) -> list[str]:
 
 
 def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Nested settings by dotted names: ``{"a": {"b": 1}}`` becomes ``{"a.b": 1}``."""
+    """Flatten nested settings to dotted names: ``{"a": {"b": 1}}`` becomes ``{"a.b": 1}``."""
     flat: dict[str, Any] = {}
     for key, value in settings.items():
         if isinstance(value, Mapping) and value:
@@ -117,6 +117,6 @@ def flatten(settings: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def _shown(path: Path) -> str:
-    """A path relative to the working directory, if it is inside."""
+    """Return a path relative to the working directory, if it is inside."""
     absolute = path.resolve()
     return absolute.relative_to(Path.cwd()).as_posix() if absolute.is_relative_to(Path.cwd()) else absolute.as_posix()

@@ -80,7 +80,7 @@ class Measure(NamedTuple):
         return f"{self.short} [{self.unit}]" if self.unit else self.short
 
     def format(self, value: float) -> str:
-        """The value with its unit, for a sentence."""
+        """Format a value with its unit, for a sentence."""
         return f"{value:.{self.digits}f}{f' {self.unit}' if self.unit else ''}"
 
 
@@ -116,7 +116,7 @@ class Results:
         return ordered({method for method, _ in self.runs})
 
     def expected_seeds(self, method: str) -> list[int]:
-        """The seeds of a method in the grids; of a method in none of them, every seed that there is."""
+        """Return the seeds of a method in the grids; of a method in none of them, every seed that there is."""
         return sorted({seed for name, seed in self.planned if name == method} or {seed for _, seed in self.runs})
 
     @property
@@ -142,27 +142,27 @@ class Results:
         return complete[complete["step"] == complete.groupby(["method", "seed"])["step"].transform("max")]
 
     def finished_seeds(self, method: str) -> list[int]:
-        """Seeds of the finished runs of a method."""
+        """Return the seeds of the finished runs of a method."""
         finished = self.finished
         return sorted({int(seed) for seed in finished.loc[finished["method"] == method, "seed"]})
 
     def scored(self) -> list[str]:
-        """Methods with a finished run, in order."""
+        """Return the methods with a finished run, in order."""
         return ordered(set(self.finished["method"]))
 
     def scores(self, method: str, measure: Measure) -> NDArray[np.float64]:
-        """Means over the final episodes of the finished runs (n_seeds, n_weathers)."""
+        """Return the means over the final episodes of the finished runs (n_seeds, n_weathers)."""
         return self._by_seed(self.finished, method, measure)
 
     def shared_steps(self) -> list[int]:
-        """Training steps at which every finished run was evaluated in every weather."""
+        """Return the training steps at which every finished run was evaluated in every weather."""
         runs = self.finished[["method", "seed"]].drop_duplicates()
         rows = self["evaluations"].merge(runs, on=["method", "seed"])
         counts = rows.groupby("step").size()
         return sorted(int(step) for step in counts.index[counts == len(runs) * len(self.weathers)])
 
     def areas(self, method: str, measure: Measure) -> NDArray[np.float64]:
-        """Means over the evaluations at :meth:`shared_steps` of the finished runs (n_seeds, n_weathers)."""
+        """Return the means over the evaluations at :meth:`shared_steps` of the finished runs (n_seeds, n_weathers)."""
         rows = self["evaluations"]
         rows = rows[rows["seed"].isin(self.finished_seeds(method)) & rows["step"].isin(self.shared_steps())]
         return self._by_seed(rows, method, measure)
@@ -174,7 +174,7 @@ class Results:
 
 
 def ordered(methods: Iterable[str]) -> list[str]:
-    """Methods in the order of :data:`METHODS`."""
+    """Sort methods in the order of :data:`METHODS`."""
     place = {method: number for number, method in enumerate(METHODS)}
     return sorted(methods, key=lambda method: (place.get(method, len(place)), method))
 
@@ -209,17 +209,17 @@ def read_results(folders: Sequence[Path], grids: Sequence[Path] | None = None) -
 
 
 def grid_of(folder: Path) -> Path:
-    """Where to look for the grid of a results folder."""
+    """Return where to look for the grid of a results folder."""
     return folder.resolve().parent.parent / "grids" / f"{folder.resolve().name}.yml"
 
 
 def method_name(method: str) -> str:
-    """Name of an entry of a grid's ``methods``: the entry itself, or the name of the file without its ending."""
+    """Return the name of an entry of a grid's ``methods``: itself, or the name of its file without the ending."""
     return Path(method).stem if method.endswith((".yml", ".yaml")) else method
 
 
 def _planned(path: Path) -> list[tuple[str, int]]:
-    """Method and seed of each run of a grid. A report reads this much of it, to do without Ray and pydantic."""
+    """Read method and seed of each run of a grid, without pydantic, which a report does not need otherwise."""
     grid = yaml.safe_load(path.read_text(encoding="utf-8"))
     return [(method_name(method), seed) for method in grid["methods"] for seed in grid["seeds"]]
 
@@ -252,7 +252,7 @@ def read_csv(path: Path) -> pd.DataFrame:
 
 
 def _converted(column: pd.Series[Any], kind: type) -> pd.Series[Any]:
-    """A column of text as numbers (truth values are 0 and 1) or text."""
+    """Convert a column of text to numbers (truth values to 0 and 1), or keep it as text."""
     values: pd.Series[Any] = column
     if kind is str:
         bad = np.asarray(column.isna() | (column.str.strip() == ""))

@@ -262,7 +262,7 @@ class Report:
 
 
 def _episodes_by_step(evaluations: pd.DataFrame) -> str:
-    """How many episodes the points of the learning curves stand for."""
+    """Describe how many episodes the points of the learning curves stand for."""
     parts = []
     for count, steps in evaluations.groupby("episodes")["step"]:
         first, last = steps.min(), steps.max()
@@ -271,7 +271,7 @@ def _episodes_by_step(evaluations: pd.DataFrame) -> str:
 
 
 def _noise(results: Results) -> str:
-    """How much of the learning curves is due to the choice of the episodes, in a sentence.
+    """Describe how much of the learning curves is due to the choice of the episodes.
 
     This is the standard error of a seed's mean over the weathers, from the standard deviations of the final episodes.
     """
@@ -293,7 +293,7 @@ def _noise(results: Results) -> str:
 
 
 def _standing(table: pd.DataFrame, measure: Measure, reference: str, weathers: Sequence[str]) -> list[str]:
-    """How the methods and drivers rank, in sentences."""
+    """Describe how the methods and drivers rank."""
     table = table[table["measure"] == measure.name]
     overall = table[table["weather"] == tables.ALL]
 
@@ -316,7 +316,7 @@ def _standing(table: pd.DataFrame, measure: Measure, reference: str, weathers: S
 
 
 def _improvements(scores: pd.DataFrame, measure: Measure, reference: str, when: str = "") -> list[str]:
-    """Which methods the reference beats by more than chance, in a sentence."""
+    """Describe which methods the reference beats by more than chance."""
     own = scores[scores["measure"] == measure.name]
     rows = own[own["improvement"].notna()]
     if rows.empty:
@@ -343,7 +343,7 @@ def _improvements(scores: pd.DataFrame, measure: Measure, reference: str, when: 
 
 
 def _listed(names: Iterable[str]) -> str:
-    """``a``, ``a and b``, ``a, b and c``."""
+    """Join names as ``a``, ``a and b`` or ``a, b and c``."""
     *most, last = list(names)
     return f"{', '.join(most)} and {last}" if most else last
 

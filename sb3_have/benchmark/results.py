@@ -24,7 +24,7 @@ def read_text_table(path: Path) -> pd.DataFrame:
 
 
 def of_run(rows: pd.DataFrame, job: Job) -> pd.Series[bool]:
-    """Which rows of a text table are of a run."""
+    """Select the rows of a run in a text table."""
     return (rows["method"] == job.method) & (rows["seed"] == str(job.seed))
 
 
@@ -49,7 +49,7 @@ def merge(results: Path, job: Job, tables: dict[str, pd.DataFrame]) -> None:
 
 
 def is_finished(results: Path, job: Job) -> bool:
-    """Whether the results contain a run with everything that the grid asks for.
+    """Return whether the results contain a run with everything that the grid asks for.
 
     :raises GridError: If they contain it with other settings
     """
@@ -74,7 +74,7 @@ def is_finished(results: Path, job: Job) -> bool:
 
 
 def settings_column(job: Job) -> str:
-    """The run's configuration and how it was evaluated, for ``runs.csv``."""
+    """Return the run's configuration and how it was evaluated, for ``runs.csv``."""
     settings = {**job.settings, "final_episodes": job.grid.final_episodes}
     if (failures := job.grid.failures) is not None:
         settings["failures"] = {**failures.model_dump(), "kinds": sorted(failures.kinds)}
@@ -82,7 +82,7 @@ def settings_column(job: Job) -> str:
 
 
 def difference(there: dict[str, Any], here: dict[str, Any]) -> str:
-    """Where two settings differ, in words; empty if they are equal."""
+    """Describe where two settings differ; empty if they are equal."""
     old, new = flatten(there), flatten(here)
     parts = [f"{key}: {old[key]!r}, not given now" for key in sorted(old.keys() - new.keys())]
     parts += [f"{key} is new" for key in sorted(new.keys() - old.keys())]

@@ -141,7 +141,7 @@ class Runner:
         return f"{job.name} died ({last_line}): resuming from its checkpoint, attempt {attempt + 1} of {attempts}"
 
     def _steps(self) -> int:
-        """Training steps of all runs so far."""
+        """Count the training steps of all runs so far."""
         return sum(
             job.grid.steps if job.name in self.finished else min(steps_done(self.runs / job.name), job.grid.steps)
             for job in self.jobs
@@ -161,7 +161,7 @@ class Runner:
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
-        """The first Ctrl-C or SIGTERM lets the runs save checkpoints, the second one stops at once."""
+        """Let the runs save checkpoints on the first Ctrl-C or SIGTERM, and stop at once on the second."""
 
         def stop(number: int, frame: FrameType | None) -> None:
             if self.stopping:

@@ -71,7 +71,7 @@ def run_job(job: Job, runs: Path, device: str = "cpu", keep_checkpoint: bool = F
 
 
 def final_folder(job: Job, folder: Path) -> Path:
-    """The folder of what follows the training."""
+    """Return the folder of what follows the training."""
     return folder / f"final-{job.grid.steps}"
 
 
@@ -113,7 +113,7 @@ def trained(job: Job, folder: Path, device: str) -> OffPolicyAlgorithm | None:
 
 
 def _rollout_length(config: dict[str, Any]) -> float:
-    """Steps of each environment between two updates."""
+    """Return the steps of each environment between two updates."""
     train_freq = config.get("train_freq", 1)
     frequency, unit = (train_freq, "step") if isinstance(train_freq, int) else train_freq
     return frequency if unit == "step" else math.inf
@@ -132,7 +132,7 @@ def _load(job: Job, folder: Path, record: dict[str, Any], device: str) -> OffPol
 
 
 def n_parameters(model: OffPolicyAlgorithm) -> int:
-    """Number of parameters that are trained: without target networks, and without heads of auxiliary losses not in use.
+    """Count the trained parameters: without target networks, and without heads of auxiliary losses not in use.
 
     :param model: The model
     """
@@ -149,8 +149,7 @@ def n_parameters(model: OffPolicyAlgorithm) -> int:
 
 
 def drive_finally(job: Job, model: OffPolicyAlgorithm, folder: Path) -> None:
-    """Drive the final episodes (``episodes.csv``) and record the weights in the first one of each weather
-    (``weights.csv``)."""
+    """Drive the final episodes (``episodes.csv``), with the weights in the first of each weather (``weights.csv``)."""
     grid, path = job.grid, final_folder(job, folder) / "episodes.csv"
     tasks = episode_tasks(grid.weathers, grid.final_episodes, grid.final_seed, partial(_wrapped, config=job.config))
     tasks.sort(key=lambda task: grid.weathers.index(task.weather))
@@ -196,7 +195,7 @@ def _drive(
 
 
 def _wrapped(env: Env, config: dict[str, Any], failure: dict[str, Any] | None = None) -> Env:
-    """The wrappers of the training, and a failing sensor outside them."""
+    """Wrap an environment as in training, with a failing sensor outside."""
     inner = env_wrapper(config)
     env = env if inner is None else inner(env)
     return env if failure is None else SensorFailure(env, **failure)
@@ -231,7 +230,7 @@ def break_sensors(job: Job, model: OffPolicyAlgorithm, folder: Path, failures: F
 
 
 def failure_cases(model: OffPolicyAlgorithm, failures: Failures) -> list[dict[str, Any]]:
-    """No failure, then every modality with every kind of failure that it has."""
+    """List the cases: no failure, then every modality with every kind of failure that it has."""
     modalities = [name for name in getattr(model.observation_space, "spaces", {}) if name in SENSORS]
     return [HEALTHY] + [
         {"modality": modality, "kind": kind, "severity": failures.severity}
@@ -279,7 +278,7 @@ def collect(job: Job, folder: Path) -> dict[str, pd.DataFrame]:
 
 
 def steps_done(folder: Path) -> int:
-    """Training steps of a run in finished episodes."""
+    """Count the training steps of a run in finished episodes."""
     # Another process may be writing the file
     with suppress(OSError, ValueError, KeyError, LoadMonitorResultsError):
         return int(load_results(str(folder))["l"].sum())

@@ -36,7 +36,7 @@ BOTH = "black = frozen"
 
 
 def weather_table(results: Results) -> pd.DataFrame:
-    """Every method in every weather (the paper's Table 1), a row for each weather, measure and driver.
+    """Compare every method in every weather (the paper's Table 1): a row for each weather, measure and driver.
 
     :param results: The results
     :return: Columns ``weather`` (the last is "all"), ``measure``, ``driver``, ``mean`` over seeds and episodes,
@@ -74,7 +74,7 @@ def _cell(group: pd.DataFrame, measure: Measure) -> dict[str, Any]:
 
 
 def weather_markdown(results: Results, table: pd.DataFrame) -> str:
-    """:func:`weather_table` as in the paper: weathers down, drivers across, the best mean in bold."""
+    """Format :func:`weather_table` as in the paper: weathers down, drivers across, the best mean in bold."""
     drivers, seeds = list(dict.fromkeys(table["driver"])), table.groupby("driver")["seeds"].max()
     cells = {(cell["weather"], cell["measure"], cell["driver"]): cell for cell in table.to_dict("records")}
     rows = []
@@ -95,7 +95,7 @@ def _mean_and_std(mean: float, std: float, measure: Measure, bold: bool = False)
 
 
 def ablation_table(results: Results) -> pd.DataFrame:
-    """The parts of HAVE one by one (the paper's Table 2), over all weathers.
+    """Compare the parts of HAVE one by one (the paper's Table 2), over all weathers.
 
     :param results: The results
     :return: A row for each method of :data:`ABLATION` that has a finished run: ``method``, ``form``, ``parameters``,
@@ -121,7 +121,7 @@ def _parameters(results: Results, method: str) -> str:
 
 
 def ablation_markdown(results: Results, table: pd.DataFrame) -> str:
-    """:func:`ablation_table`, the best means in bold."""
+    """Format :func:`ablation_table`, the best means in bold."""
     rows = []
     for row in table.to_dict("records"):
         cells = [row["method"], row["form"], row["parameters"] or "–", str(row["seeds"])]
@@ -134,7 +134,7 @@ def ablation_markdown(results: Results, table: pd.DataFrame) -> str:
 
 
 def score_table(results: Results, reference: str = "have", areas: bool = False) -> pd.DataFrame:
-    """Statistics over seeds and weathers with 95% intervals, which are NaN below :data:`MIN_SEEDS` seeds.
+    """Compute statistics over seeds and weathers with 95% intervals, which are NaN below :data:`MIN_SEEDS` seeds.
 
     :param results: The results
     :param reference: Method to compare with each of the others
@@ -159,14 +159,14 @@ def score_table(results: Results, reference: str = "have", areas: bool = False) 
 
 
 def interval(statistic: Callable[..., Any], *scores: ArrayLike) -> Interval:
-    """A statistic with its bootstrap interval, which is NaN if a table has fewer runs than :data:`MIN_SEEDS`."""
+    """Compute a statistic with its bootstrap interval, which is NaN below :data:`MIN_SEEDS` runs in a table."""
     if min(len(np.asarray(table)) for table in scores) < MIN_SEEDS:
         return Interval(statistic(*scores), np.nan, np.nan)
     return stratified_bootstrap(statistic, *scores, whole_runs=True)
 
 
 def score_markdown(table: pd.DataFrame, measure: Measure, reference: str) -> str:
-    """The rows of :func:`score_table` for one measure."""
+    """Format the rows of :func:`score_table` for one measure."""
 
     def cell(row: dict[Any, Any], name: str, digits: int) -> str:
         value, lower, upper = (row[f"{name}{end}"] for end in ("", "_lower", "_upper"))
@@ -181,7 +181,7 @@ def score_markdown(table: pd.DataFrame, measure: Measure, reference: str) -> str
 
 
 def run_table(results: Results) -> pd.DataFrame:
-    """The progress of every method: which seeds are finished, under way, or not begun.
+    """List the progress of every method: which seeds are finished, under way, or not begun.
 
     Expected are the runs of the grids; if those are not known, every seed of every method.
 
@@ -214,21 +214,21 @@ def run_table(results: Results) -> pd.DataFrame:
 
 
 def _newest(rows: pd.DataFrame, weathers: int) -> str:
-    """The step of a run's newest evaluation, and the number of weathers if some are missing."""
+    """Describe a run's newest evaluation by its step, and the number of weathers if some are missing."""
     step = rows["step"].max()
     known = rows.loc[rows["step"] == step, "weather"].nunique()
     return f"at {step}" if known == weathers else f"at {step}, {known} of {weathers} weathers"
 
 
 def run_markdown(table: pd.DataFrame) -> str:
-    """:func:`run_table`."""
+    """Format :func:`run_table`."""
     shown = table.assign(minutes=table["minutes"].map(lambda value: "" if np.isnan(value) else f"{value:.0f}"))
     heads = ["method", "parameters", "steps", "finished seeds", "under way", "not begun", "minutes a run (median)"]
     return markdown_table(heads, [[cell or "–" for cell in row] for row in shown.astype(str).to_numpy().tolist()])
 
 
 def end_table(results: Results) -> pd.DataFrame:
-    """How the episodes of the finished runs ended.
+    """Count how the episodes of the finished runs ended.
 
     :param results: The results
     :return: A row for each method: ``method``, ``episodes``, ``crashed`` and ``offroad`` (shares), ``steps`` (mean)
@@ -243,7 +243,7 @@ def end_table(results: Results) -> pd.DataFrame:
 
 
 def end_markdown(table: pd.DataFrame) -> str:
-    """:func:`end_table`."""
+    """Format :func:`end_table`."""
     rows = [
         [row["method"], str(row["episodes"]), f"{row['crashed']:.2f}", f"{row['offroad']:.2f}", f"{row['steps']:.0f}"]
         for row in table.to_dict("records")
@@ -252,7 +252,7 @@ def end_markdown(table: pd.DataFrame) -> str:
 
 
 def failure_table(results: Results) -> pd.DataFrame:
-    """Return and distance under each sensor failure, and in the same episodes without a failure.
+    """Compare return and distance under each sensor failure, and in the same episodes without a failure.
 
     Where a frozen sensor gave the same results as a black one, they are one case: an event camera that is frozen from
     the reset on shows no events.
@@ -282,7 +282,7 @@ def failure_table(results: Results) -> pd.DataFrame:
 
 
 def _join_black_and_frozen(failures: pd.DataFrame) -> pd.DataFrame:
-    """Merge the two kinds where they gave the same results."""
+    """Merge black and frozen where they gave the same results."""
     for (modality, severity), rows in failures.groupby(["modality", "severity"], sort=False):
         black, frozen = (
             rows[rows["kind"] == kind].set_index(["method", "seed", "weather"])["return_mean"].sort_index()
@@ -296,7 +296,7 @@ def _join_black_and_frozen(failures: pd.DataFrame) -> pd.DataFrame:
 
 
 def cases_of(table: pd.DataFrame) -> dict[tuple[str, str, int], str]:
-    """The cases of :func:`failure_table` in order, with their names (and severities if there are several)."""
+    """Return the cases of :func:`failure_table` in order, with their names (and severities if there are several)."""
     cases = dict.fromkeys(zip(*(table[name] for name in CASE), strict=True))
     several = len({severity for _, kind, severity in cases if kind != "none"}) > 1
     return {
@@ -308,7 +308,7 @@ def cases_of(table: pd.DataFrame) -> dict[tuple[str, str, int], str]:
 
 
 def failure_markdown(table: pd.DataFrame, measure: Measure) -> str:
-    """The means of :func:`failure_table` for one measure: methods down, cases across."""
+    """Format the means of :func:`failure_table` for one measure: methods down, cases across."""
     seeds = table.groupby("method")["seeds"].max()
     names = {method: f"{method} ({seeds[method]})" for method in table["method"]}
     return _by_case(
@@ -317,14 +317,14 @@ def failure_markdown(table: pd.DataFrame, measure: Measure) -> str:
 
 
 def kept_markdown(table: pd.DataFrame, measure: Measure) -> str:
-    """The shares of :func:`failure_table` for one measure: methods down, failures across."""
+    """Format the shares of :func:`failure_table` for one measure: methods down, failures across."""
     broken = table[table["kind"] != "none"]
     names = {method: method for method in broken["method"]}
     return _by_case(broken, names, lambda row: f"{row[f'{measure.name}_kept']:.2f}")
 
 
 def lead_markdown(table: pd.DataFrame, measure: Measure, reference: str) -> str:
-    """The reference's mean minus that of each other method: methods down, cases across."""
+    """Format the reference's mean minus that of each other method: methods down, cases across."""
     own = table[table["method"] == reference].set_index(CASE)[f"{measure.name}_mean"]
     others = table[table["method"] != reference]
 

@@ -1,6 +1,6 @@
-"""
-Driving trained models and rule-based drivers: the one loop over episodes, evaluation by weather, recordings of single
-episodes, and statistics over runs. Training and figures do not belong here.
+"""Drive and evaluate models and rule-based drivers, record episodes, and compute statistics over runs.
+
+Training and figures do not belong here.
 """
 
 from sb3_have.evaluation.episodes import Predictor, Step, Task, drive

@@ -99,7 +99,7 @@ class Step(NamedTuple):
     :param returns: Return of each episode before this step, shape (n,)
     :param observations: The batch that the model read
     :param infos: The ``info`` of each environment before the step
-    :param actions: What the model did, shape (n, \\*action_shape)
+    :param actions: What the model did, shape (n,) and that of an action
     :param rewards: Shape (n,)
     :param dones: Whether each episode ended with this step, shape (n,)
     :param next_infos: The ``info`` of each environment after the step; of the old episode, if it ended

@@ -96,7 +96,7 @@ def evaluate_episodes(
 def episode_tasks(
     weathers: Sequence[str], n_episodes: int, seed: int, env_wrapper: Callable[[Env], Env] | None = None
 ) -> list[Task]:
-    """The episodes of :func:`evaluate`, which has the same parameters. Weathers vary fastest."""
+    """List the episodes of :func:`evaluate`, which has the same parameters. Weathers vary fastest."""
     if n_episodes < 1 or not weathers:
         raise ValueError(f"need n_episodes >= 1 and a weather, got {n_episodes} and {list(weathers)}")
     # Every weather has its own traffic, the same for every driver: more situations for the same number of episodes
@@ -154,7 +154,7 @@ def _make_env(env_id: str, env_kwargs: dict[str, Any], task: Task) -> Env:
 
 
 def _outcome(step: Step, i: int) -> dict[str, Any]:
-    """The row of an episode that ended with this step."""
+    """Return the row of an episode that ended with this step."""
     info = step.next_infos[i]
     facts = {key: float(info.get(key, np.nan)) for key in ("distance", "crashed", "offroad")}
     return {"return": step.returns[i] + step.rewards[i], "steps": int(step.t[i]) + 1, **facts}
@@ -199,7 +199,7 @@ def format_table(results: Mapping[str, pd.DataFrame]) -> str:
 
 
 def pooled(frame: pd.DataFrame, name: str) -> tuple[float, float]:
-    """Mean and standard deviation over all episodes, from those of groups of episodes.
+    """Compute mean and standard deviation over all episodes, from those of groups of episodes.
 
     :param frame: Columns ``episodes``, ``<name>_mean`` and ``<name>_std``
     :param name: "return" or "distance"
@@ -210,7 +210,7 @@ def pooled(frame: pd.DataFrame, name: str) -> tuple[float, float]:
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A Markdown table whose columns line up in plain text too."""
+    """Format a Markdown table whose columns line up in plain text too."""
     table = [[str(cell).replace("|", "\\|") for cell in row] for row in [header, *rows]]
     widths = [max(3, *(len(row[column]) for row in table)) for column in range(len(header))]
     lines = ["| " + " | ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)) + " |" for row in table]

@@ -137,7 +137,7 @@ def _record(
 
 
 def weighing(model: Any) -> Callable[[Any], Mapping[str, np.ndarray]] | None:
-    """``model.modality_weights``, or None if the model has no weights, as with ``value_estimation="gve"``."""
+    """Return ``model.modality_weights``, or None if the model has no weights, as with ``value_estimation="gve"``."""
     if getattr(getattr(model, "critic", None), "value_estimation", None) == "gve":
         return None
     method: Callable[[Any], Mapping[str, np.ndarray]] | None = getattr(model, "modality_weights", None)

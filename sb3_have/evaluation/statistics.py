@@ -1,6 +1,6 @@
-"""
-Statistics over training runs, after Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical
-Precipice" (NeurIPS 2021).
+"""Statistics over training runs.
+
+They follow Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice" (NeurIPS 2021).
 
 A table of scores has a row for each run (seed) and a column for each task (weather). Every statistic also takes a stack
 of tables, (..., n_runs, n_tasks), and returns one value for each, so that the bootstrap needs no loop.
@@ -24,7 +24,7 @@ class Interval(NamedTuple):
 
 
 def mean(scores: ArrayLike) -> Any:
-    """Mean over runs and tasks.
+    """Compute the mean over runs and tasks.
 
     :param scores: (n_runs, n_tasks), or a stack of such tables (..., n_runs, n_tasks)
     :return: A float, or (...) for a stack
@@ -34,12 +34,12 @@ def mean(scores: ArrayLike) -> Any:
 
 
 def median(scores: ArrayLike) -> Any:
-    """Median over tasks of the mean over runs; parameters as for :func:`mean`."""
+    """Compute the median over tasks of the mean over runs; parameters as for :func:`mean`."""
     return np.median(_table(scores).mean(axis=-2), axis=-1)
 
 
 def iqm(scores: ArrayLike) -> Any:
-    """Interquartile mean: the mean of all scores together, without the lowest and the highest quarter.
+    """Compute the interquartile mean: the mean of all scores together, without the lowest and the highest quarter.
 
     A quarter of n scores is ``n // 4``, so fewer than four scores are all kept. Parameters as for :func:`mean`.
     """
@@ -50,7 +50,7 @@ def iqm(scores: ArrayLike) -> Any:
 
 
 def optimality_gap(scores: ArrayLike, target: float = 1.0) -> Any:
-    """Mean shortfall of the scores from a target; scores above it do not make up for others below.
+    """Compute the mean shortfall of the scores from a target; scores above it do not make up for others below.
 
     :param scores: As for :func:`mean`
     :param target: In the scores' unit
@@ -60,7 +60,9 @@ def optimality_gap(scores: ArrayLike, target: float = 1.0) -> Any:
 
 
 def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> Any:
-    """How often a run of ``x`` beats one of ``y`` on the same task: the mean over tasks of Mann-Whitney's U / (N M).
+    """Compute how often a run of ``x`` beats one of ``y`` on the same task.
+
+    This is the mean over tasks of Mann-Whitney's U / (N M).
 
     :param x: (N, n_tasks) scores, or a stack (..., N, n_tasks)
     :param y: (M, n_tasks) scores on the same tasks, in a stack of the same shape
@@ -76,7 +78,7 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> Any:
 
 
 def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> np.ndarray:
-    """Share of runs, over all tasks, that score above each threshold.
+    """Compute the share of runs, over all tasks, that score above each threshold.
 
     For a band, bootstrap ``partial(performance_profile, thresholds=...)``.
 
@@ -96,7 +98,7 @@ def stratified_bootstrap(
     seed: int = 0,
     whole_runs: bool = False,
 ) -> Interval:
-    """Percentile bootstrap that resamples runs within each task, independently for each task and each table.
+    """Bootstrap percentile intervals by resampling runs within each task, independently for each task and table.
 
     Use it as ``stratified_bootstrap(iqm, scores)`` or ``stratified_bootstrap(probability_of_improvement, x, y)``.
 
@@ -146,7 +148,7 @@ def stratified_bootstrap(
 
 
 def _table(scores: ArrayLike) -> np.ndarray:
-    """Scores as float64 (..., n_runs, n_tasks)."""
+    """Convert scores to float64 (..., n_runs, n_tasks)."""
     table = np.asarray(scores, dtype=np.float64)
     if table.ndim < 2 or 0 in table.shape:
         raise ValueError(
