@@ -74,15 +74,3 @@ def test_merge_that_is_cut_off_leaves_no_finished_run(tmp_path: Path, monkeypatc
     merge(results, second, tables[second.name])
     assert is_finished(results, second)
     assert not read_results([results])["final"].duplicated().any()
-
-
-def test_file_is_whole_or_as_it_was(tmp_path: Path) -> None:
-    def write_half(path: Path) -> None:
-        path.write_text("ha")
-        raise OSError("no space left")
-
-    path = tmp_path / "rows.csv"
-    path.write_text("before")
-    with pytest.raises(OSError, match="no space"):
-        files.write_atomically(path, write_half)
-    assert path.read_text() == "before"

@@ -174,9 +174,13 @@ def test_stop_asks_all_runs_to_save(
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_missing_ray(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
+@pytest.mark.parametrize("missing", ["ray", "pydantic"])
+def test_missing_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
     make_grid(tmp_path)
+    monkeypatch.setitem(sys.modules, missing, None)
+    if missing == "pydantic":
+        for name in ("runner", "pool", "results", "stages", "grid"):
+            monkeypatch.delitem(sys.modules, f"sb3_have.benchmark.{name}")
     where = ["--runs", str(tmp_path / "runs"), "--results", str(tmp_path / "results")]
     with pytest.raises(SystemExit, match=r'pip install "sb3_have\[benchmark\]"'):
         main(["run", str(tmp_path / "mine.yml"), *where])

@@ -91,40 +91,6 @@ def test_probability_of_improvement_against_brute_force(pair: tuple[np.ndarray, 
     assert probability_of_improvement(x**3, y**3) == probability_of_improvement(x, y)
 
 
-@untimed
-@given(tables(), st.integers(0, 2**32 - 1))
-def test_order_of_runs_and_tasks_is_without_effect(scores: np.ndarray, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    shuffled = rng.permuted(scores, axis=0)[:, rng.permutation(scores.shape[1])]
-    statistics: list[Callable[..., Any]] = [*SINGLE, partial(performance_profile, thresholds=[0.0, 2.0])]
-    for statistic in statistics:
-        np.testing.assert_allclose(statistic(scores), statistic(shuffled), rtol=0, atol=1e-12)
-    other = rng.integers(-20, 20, (3, scores.shape[1])).astype(float)
-    order = rng.permutation(scores.shape[1])
-    assert probability_of_improvement(rng.permuted(scores, axis=0)[:, order], other[:, order]) == pytest.approx(
-        probability_of_improvement(scores, other)
-    )
-
-
-@untimed
-@given(tables(), st.integers(-5, 5), st.integers(1, 5))
-def test_units_carry_through(scores: np.ndarray, shift: int, scale: int) -> None:
-    for statistic in (iqm, mean, median):
-        assert statistic(scale * scores + shift) == pytest.approx(scale * statistic(scores) + shift)
-        assert scores.min() - 1e-12 <= statistic(scores) <= scores.max() + 1e-12
-    assert optimality_gap(scale * scores + shift, scale + shift) == pytest.approx(scale * optimality_gap(scores))
-
-
-@untimed
-@given(tables(min_runs=4))
-def test_outliers_move_the_mean_and_not_the_iqm(scores: np.ndarray) -> None:
-    """As many as a quarter of the scores."""
-    wild = scores.copy().ravel()
-    wild[np.argsort(wild)[-(wild.size // 4) :]] = 1e6
-    assert iqm(wild.reshape(scores.shape)) == pytest.approx(iqm(scores))
-    assert mean(wild.reshape(scores.shape)) > mean(scores) + 1000
-
-
 @pytest.mark.parametrize("statistic", [*SINGLE, partial(performance_profile, thresholds=[0.0, 0.5])])
 def test_a_stack_gives_what_its_tables_give(statistic: Callable[..., Any]) -> None:
     stack = np.random.default_rng(0).normal(size=(2, 3, 6, 4))

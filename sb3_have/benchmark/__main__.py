@@ -14,7 +14,13 @@ def main(arguments: list[str] | None = None) -> int:
     if not arguments or arguments[0] not in COMMANDS:
         print(f"usage: python -m sb3_have.benchmark {{{','.join(COMMANDS)}}} ...\n{__doc__}", file=sys.stderr)
         return 0 if arguments in (["-h"], ["--help"]) else 2
-    return import_module(COMMANDS[arguments[0]]).main(arguments[1:]) or 0
+    try:
+        command = import_module(COMMANDS[arguments[0]])
+    except ModuleNotFoundError as error:
+        if error.name != "pydantic":
+            raise
+        raise SystemExit('a benchmark needs pydantic and Ray: pip install "sb3_have[benchmark]"') from None
+    return command.main(arguments[1:]) or 0
 
 
 if __name__ == "__main__":
