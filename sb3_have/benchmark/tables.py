@@ -41,7 +41,7 @@ def weather_table(results: Results) -> pd.DataFrame:
     :param results: The results
     :return: Columns ``weather`` (the last is "all"), ``measure``, ``driver``, ``mean`` over seeds and episodes,
         ``std``, ``spread`` (what ``std`` is over: "seeds" (their means, ddof=1) if there are several, else "episodes"
-        (ddof=0)), ``seeds`` (0 for a untrained driver), ``episodes`` of all seeds together, and ``best``
+        (ddof=0)), ``seeds`` (0 for an untrained driver), ``episodes`` of all seeds together, and ``best``
         (whether no other method has a higher mean)
     """
     groups = [(method, results.finished[results.finished["method"] == method]) for method in results.scored()]
