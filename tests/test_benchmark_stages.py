@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pandas as pd
 import pytest
 from fake_drive import ENV_ID
@@ -17,7 +18,7 @@ from sb3_have.benchmark import stages
 from sb3_have.benchmark.grid import FINAL_SEED, Job
 from sb3_have.benchmark.results import is_finished, merge
 from sb3_have.benchmark.stages import collect, run_job
-from sb3_have.evaluation.episodes import Task
+from sb3_have.evaluation.episodes import Step, Task
 from sb3_have.evaluation.evaluation import episode_tasks
 from sb3_have.train import EVALUATION_SEED, Run, newest_checkpoint
 
@@ -70,6 +71,23 @@ def test_stages_do_not_depend_on_the_number_of_environments(tmp_path: Path) -> N
     for name, table in files[1].items():
         pd.testing.assert_frame_equal(table, files[5][name], atol=2e-4)
     assert files[1]["failures"]["return_mean"].nunique() == 8
+
+
+def test_weights_belong_to_their_episode() -> None:
+    """The first environment drives another episode, the third none, and the fourth is between two rows."""
+
+    class Model:
+        def modality_weights(self, observations: np.ndarray) -> dict[str, np.ndarray]:
+            return {"rgb": observations, "depth": 1 - observations}
+
+    tasks = [Task("slow", 1), Task("slow", 2), Task("fast", 3), Task("fast", 4)]
+    numbers, t, returns = [1, 2, None, 0], np.array([5, 5, 5, 6]), np.array([2.0, 1.5, 3.0, 4.0])
+    nothing: Any = []
+    step = Step(numbers, t, returns, np.array([0.5, 0.25, 0.5, 0.5]), *[nothing] * 5)
+    rows: list[dict[str, Any]] = []
+    stages._record_weights(Model(), tasks, range(0, 4, 2), rows, step)
+    key = {"weather": "fast", "episode_seed": 3, "t": 5, "return_so_far": 1.5}
+    assert rows == [{**key, "modality": "rgb", "weight": 0.25}, {**key, "modality": "depth", "weight": 0.75}]
 
 
 def test_failures_may_be_added_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
