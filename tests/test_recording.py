@@ -77,6 +77,8 @@ def test_an_id_without_weather_is_rendered_where_it_can_be() -> None:
     assert len(recording.rewards) == len(recording.pictures) == 5
     assert recording.pictures[0].shape == (40, 80, 3) and recording.seconds == 0.2
     assert recording.rewards == pytest.approx(1 + recording.actions[:, 0])  # slow: 1 m and the throttle
+    # Each info is from before the action
+    assert [info["distance"] for info in recording.infos] == [0, 1, 2, 3, 4] and recording.end["distance"] == 5
     assert not recording.values and not recording.weights
     assert not record_episode(RandomDriver(), ENV_ID).pictures
     assert len(record_episode(RandomDriver(), ENV_ID, "fast", max_steps=2).rewards) == 2
