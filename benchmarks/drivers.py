@@ -1,9 +1,9 @@
-"""Drivers that did not learn, over the very episodes of a grid's final evaluation, for its report to compare with.
+"""Drive untrained drivers in the episodes of a grid's final evaluation, for comparison in its report.
 
     python -m benchmarks.drivers benchmarks/grids/core.yml
 
-They are a random one, one that goes straight on at 20 m/s, and highway-env's own, which sees all traffic (IDM/MOBIL).
-Writes ``drivers.csv`` beside the results of the agents.
+They are a random driver, one that goes straight ahead at 20 m/s, and highway-env's own, which knows all traffic
+(IDM/MOBIL). The script writes ``drivers.csv`` beside the results of the methods.
 """
 
 from __future__ import annotations
@@ -17,17 +17,16 @@ import gymnasium as gym
 import pandas as pd
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
-from sb3_have.benchmark.grid import FINAL_SEED, Grid, read_grid
+from sb3_have.benchmark.grid import Grid, read_grid
 from sb3_have.benchmark.reading import FILES
 from sb3_have.benchmark.stages import DIGITS
 from sb3_have.checkpoint.files import write_atomically
 from sb3_have.configuration import evaluation_env_kwargs
 from sb3_have.envs.drivers import KeepStraightDriver, RandomDriver
-from sb3_have.evaluation.episodes import Predictor
-from sb3_have.evaluation.evaluation import evaluate
+from sb3_have.evaluation import Predictor, evaluate
 
+# HighwayVision-v0 that ignores actions and drives itself; with the module, worker processes can register it too
 IDM_ID = "benchmarks.drivers:RuleDriven-v0"
-"""HighwayVision-v0 that drives by itself; the module in front registers it in processes of its own too."""
 
 if "RuleDriven-v0" not in gym.registry:
     of_agents = gym.spec("HighwayVision-v0")
@@ -41,20 +40,20 @@ if "RuleDriven-v0" not in gym.registry:
 
 
 def drive(grid: Grid, processes: int = 1) -> pd.DataFrame:
-    """Each driver in each weather, in the environment of the grid's first method.
+    """Drive each driver in each weather, in the environment of the grid's first method.
 
-    :param grid: on HighwayVision-v0
-    :param processes: that drive; the random driver's actions depend on their number
-    :return: rows of ``drivers.csv``
-    :raises ValueError: if the grid has another environment
+    :param grid: A grid on HighwayVision-v0
+    :param processes: Number of processes; the random driver's actions depend on it
+    :return: Rows of ``drivers.csv``
+    :raises ValueError: If the grid has another environment
     """
     if grid.env != "HighwayVision-v0":
-        raise ValueError(f"these drivers know HighwayVision-v0 alone, not {grid.env}, the env of the grid")
+        raise ValueError(f"these drivers need HighwayVision-v0, and the grid's env is {grid.env}")
     env_kwargs = evaluation_env_kwargs(grid.jobs()[0].config)
     drivers: dict[str, tuple[Predictor, str]] = {
         "random": (RandomDriver(0), grid.env),
         "straight at 20 m/s": (KeepStraightDriver(20.0), grid.env),
-        "IDM/MOBIL": (RandomDriver(0), IDM_ID),  # its actions are not heeded
+        "IDM/MOBIL": (RandomDriver(0), IDM_ID),  # the environment ignores its actions
     }
     parts = []
     for name, (driver, env_id) in drivers.items():
@@ -63,7 +62,7 @@ def drive(grid: Grid, processes: int = 1) -> pd.DataFrame:
             env_id,
             grid.weathers,
             grid.final_episodes,
-            FINAL_SEED,
+            grid.final_seed,
             env_kwargs,
             n_envs=processes,
             vec_env_cls=SubprocVecEnv if processes > 1 else DummyVecEnv,
@@ -80,8 +79,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Write ``drivers.csv``."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.drivers", description=(__doc__ or "").splitlines()[0])
     parser.add_argument("grid", type=Path, help="YAML file, see sb3_have.benchmark.grid")
-    parser.add_argument("--results", type=Path, help="default: benchmarks/results/<name of the grid>")
-    parser.add_argument("--processes", type=int, default=1, help="that drive")
+    parser.add_argument(
+        "--results", type=Path, help="folder of the results; default: benchmarks/results/<name of the grid>"
+    )
+    parser.add_argument("--processes", type=int, default=1, help="number of processes")
     args = parser.parse_args(arguments)
     grid = read_grid(args.grid)
     results = args.results or Path("benchmarks") / "results" / grid.name

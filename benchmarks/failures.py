@@ -1,13 +1,13 @@
-"""How far a trained model still drives when one of its sensors fails for whole episodes.
+"""Measure how far a trained model drives when one of its sensors fails for whole episodes.
 
-    python -m sb3_have.demo                                              # trains a model, or take one of your own
+    python -m sb3_have.demo                                              # trains a model
     python -m benchmarks.failures runs/demo/havesac_demo.zip --config havesac
 
-Each of rgb, event and depth fails in every way that it can, at one severity, on top of the configuration's own
-``env_wrapper``; the episodes are the same for all, drawn from all weathers. Each row is appended to the CSV file as it
-is made; the same command goes on where it was stopped. Columns:
-``modality, kind, severity`` ("none" for the healthy car), ``distance_mean``, ``distance_std`` [m] and ``return_mean``
-over the ``episodes``, ``kept``: the distance over the healthy one, ``crash_share`` and ``offroad_share``.
+Each of rgb, event and depth fails in every way that it can, at one severity, outside the configuration's own
+``env_wrapper``. All cases have the same episodes, in all weathers. Each row is appended to the CSV file when it is
+complete, and the same command resumes. Columns: ``modality, kind, severity`` ("none" without a failure),
+``distance_mean``, ``distance_std`` [m] and ``return_mean`` over the ``episodes``, ``kept`` (the distance divided by the
+one without a failure), ``crash_share`` and ``offroad_share``.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from benchmarks.measure import RESULTS, machine
 from sb3_have import HAVESAC
 from sb3_have.configuration import Env, env_wrapper, evaluation_env_kwargs, load_config
 from sb3_have.envs.weather import WEATHERS
-from sb3_have.evaluation.evaluation import evaluate_episodes
+from sb3_have.evaluation import evaluate_episodes
 from sb3_have.sensors import SENSORS, SensorFailure, failures_for
 
 NONE = ("none", "none", 0)
@@ -34,7 +34,7 @@ Case = tuple[str, str, int]
 
 
 def cases(space: spaces.Space[Any], severity: int) -> Iterator[Case]:
-    """The healthy car, then every modality called rgb, event or depth with every kind of failure it knows."""
+    """No failure, then every modality called rgb, event or depth with every kind of failure that it has."""
     assert isinstance(space, spaces.Dict)
     yield NONE
     for modality in space.spaces:
@@ -44,7 +44,7 @@ def cases(space: spaces.Space[Any], severity: int) -> Iterator[Case]:
 
 
 def wrapped(env: Env, inner: Callable[[Env], Env] | None, case: Case) -> Env:
-    """The environment of the training with a failure on top."""
+    """The environment of the training, with a failing sensor outside its wrappers."""
     env = env if inner is None else inner(env)
     modality, kind, severity = case
     return env if case == NONE else SensorFailure(env, modality, kind, severity)
@@ -59,14 +59,15 @@ def drive(
     inner: Callable[[Env], Env] | None = None,
     **kwargs: Any,
 ) -> dict[str, Any]:
-    """One row of the table.
+    """Drive one row of the table.
 
-    :param model: trained on ``env_id``
-    :param case: modality, kind and severity
-    :param n_episodes: in each weather
-    :param seed: of the episodes
-    :param inner: wrapper of the training, see :func:`~sb3_have.configuration.env_wrapper`
-    :param kwargs: further ones of :func:`~sb3_have.evaluation.evaluation.evaluate_episodes`
+    :param model: The model
+    :param env_id: Id of its environment
+    :param case: Modality, kind and severity
+    :param n_episodes: Episodes in each weather
+    :param seed: Seed of the episodes
+    :param inner: Wrapper of the training, see :func:`~sb3_have.configuration.env_wrapper`
+    :param kwargs: Further keywords of :func:`~sb3_have.evaluation.evaluation.evaluate_episodes`
     """
     modality, kind, severity = case
     wrapper = partial(wrapped, inner=inner, case=case)
@@ -85,13 +86,13 @@ def drive(
 
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("model", type=Path, help="zip file of a HAVESAC")
-    parser.add_argument("--config", default="havesac", help="the configuration it was trained with")
+    parser.add_argument("model", type=Path, help="zip file of a HAVESAC model")
+    parser.add_argument("--config", default="havesac", help="configuration of its training")
     parser.add_argument("--env", default="HighwayVision-v0")
     parser.add_argument("--severity", type=int, default=3, choices=(1, 2, 3))
-    parser.add_argument("--episodes", type=int, default=2, help="in each weather")
-    parser.add_argument("--seed", type=int, default=0, help="of the episodes")
-    parser.add_argument("--envs", type=int, default=16, help="driven at a time")
+    parser.add_argument("--episodes", type=int, default=2, help="episodes in each weather")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the episodes")
+    parser.add_argument("--envs", type=int, default=16, help="number of environments")
     parser.add_argument("--out", type=Path, default=RESULTS / "failures.csv")
     args = parser.parse_args(arguments)
 
@@ -105,7 +106,7 @@ def main(arguments: list[str] | None = None) -> None:
     if args.out.exists():
         done = pd.read_csv(args.out, keep_default_na=False)
         if (done[list(of_run)] != list(of_run.values())).any(axis=None):
-            raise SystemExit(f"{args.out} is of another run than {of_run}: give another --out, or remove it")
+            raise SystemExit(f"{args.out} has rows of another run than {of_run}: choose another --out, or remove it")
     finished = set(zip(done["modality"], done["kind"], done["severity"], strict=True))
     for case in cases(model.observation_space, args.severity):
         if case in finished:
@@ -117,7 +118,10 @@ def main(arguments: list[str] | None = None) -> None:
         frame = pd.DataFrame([row]).round(3)
         frame.to_csv(args.out, mode="a", header=not args.out.exists(), index=False)
         done = pd.concat([done, frame]) if len(done) else frame
-        print(f"{case[0]:6} {case[1]:16} {row['distance_mean']:6.0f} m, {row['kept']:.2f} of the healthy", flush=True)
+        print(
+            f"{case[0]:6} {case[1]:16} {row['distance_mean']:6.0f} m, {row['kept']:.2f} of that without a failure",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

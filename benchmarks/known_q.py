@@ -32,7 +32,7 @@ from stable_baselines3.sac.policies import Actor
 
 from benchmarks.measure import RESULTS
 from sb3_have import HAVESAC, MultiModalPolicy
-from sb3_have.benchmark.machine import machine
+from sb3_have.benchmark.provenance import machine
 
 Floats: TypeAlias = NDArray[np.floating[Any]]
 Observation: TypeAlias = dict[str, NDArray[np.float32]]

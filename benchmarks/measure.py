@@ -12,7 +12,7 @@ import pandas as pd
 import torch as th
 from numpy.typing import NDArray
 
-from sb3_have.benchmark.machine import machine as machine
+from sb3_have.benchmark.provenance import machine as machine
 
 RESULTS = Path(__file__).parent / "results"
 Name = TypeVar("Name")

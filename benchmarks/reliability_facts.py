@@ -29,7 +29,7 @@ from benchmarks.reliability_report import KEPT, REFERENCE, values
 from benchmarks.reliability_runs import EVALUATION_SEED, N_EPISODES, N_MODALITIES, Drive
 from benchmarks.reliability_vec_env import ReliabilityDriveVecEnv
 from sb3_have.envs.reliability_drive import ACROSS, ALONG, CHANNELS, DRAG, DT, DriveBatch
-from sb3_have.evaluation.evaluation import mean, stratified_bootstrap
+from sb3_have.evaluation.statistics import mean, stratified_bootstrap
 
 Row = dict[str, Any]
 # A function from the drives, including their true state, to actions (N, 2)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pandas as pd
 
-from sb3_have.evaluation.evaluation import Interval, iqm, mean, probability_of_improvement, stratified_bootstrap
+from sb3_have.evaluation.statistics import Interval, iqm, mean, probability_of_improvement, stratified_bootstrap
 
 REFERENCE = "have"
 SCORES = {"final_return": "final return", "area": "area under the curve"}

@@ -1,8 +1,8 @@
-"""rliable's figures for a few tables of scores, with which our statistics must agree.
+"""Compute rliable's figures for a few tables of scores, as the reference of our statistics.
 
-rliable (https://github.com/google-research/rliable) is the reference implementation of Agarwal et al. 2021. It depends
-on much that nothing else here needs, so its figures are committed, and `tests/test_statistics.py` compares with them.
-To make them anew (minutes), in an environment of its own that needs no ``sb3_have``::
+rliable (https://github.com/google-research/rliable) is the reference implementation of Agarwal et al. 2021. It has many
+dependencies that nothing else here needs, so its figures are committed, and `tests/test_statistics.py` compares with
+them. To compute them again (which takes minutes), use a separate environment, which does not need ``sb3_have``::
 
     python -m venv rliable-venv
     rliable-venv/bin/pip install "rliable==1.2.0" "pandas<3"
@@ -22,17 +22,17 @@ import numpy as np
 
 OUT = Path(__file__).parents[1] / "tests" / "rliable_figures.json"
 
-# Runs of x, runs of y, tasks, and decimals kept: with none or one, ties abound.
+# Runs of x, runs of y, tasks, and decimals: with none or one, there are many ties
 SHAPES = [(3, 3, 1, 1), (8, 8, 1, 0), (5, 3, 2, 4), (10, 7, 3, 1), (16, 16, 8, 0), (4, 16, 8, 4), (3, 5, 8, 1)]
 AGGREGATES = ("iqm", "mean", "median", "optimality_gap")
 THRESHOLDS = (-1.0, 0.0, 0.5, 1.0, 2.5)
 CONFIDENCE = 0.95
 RESAMPLES = 10_000
-RESAMPLES_OF_PAIRS = 2_000  # slow: a call of SciPy for each task of each
+RESAMPLES_OF_PAIRS = 2_000  # slow: rliable calls SciPy for each task of each resample
 
 
 def tables(case: int) -> tuple[np.ndarray, np.ndarray]:
-    """Scores of two methods, of tasks that differ in level and spread."""
+    """Scores of two methods on tasks that differ in level and spread."""
     runs_x, runs_y, tasks, decimals = SHAPES[case]
     rng = np.random.default_rng(case)
     level, spread = rng.normal(0.5, 0.5, tasks), rng.uniform(0.5, 1.5, tasks)
@@ -56,7 +56,7 @@ def figures(case: int) -> dict[str, Any]:
     result: dict[str, Any] = {"x": x.tolist(), "y": y.tolist()}
     aggregates = [getattr(metrics, f"aggregate_{name}") for name in AGGREGATES]
     result["aggregates"] = interval("x", lambda s: np.array([f(s) for f in aggregates]), x, RESAMPLES)
-    # rliable takes a name with a comma for a pair of methods, whose runs it draws independently
+    # rliable treats a name with a comma as a pair of methods, whose runs it resamples independently
     better = metrics.probability_of_improvement
     result["improvement"] = interval("x,y", lambda s, t: np.array([better(s, t)]), (x, y), RESAMPLES_OF_PAIRS)
     above = library.run_score_deviation
@@ -65,7 +65,7 @@ def figures(case: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Write the figures, one table or statistic a line."""
+    """Write the figures, with one table or statistic per line."""
     made_with = {name: version(name) for name in ("rliable", "arch", "scipy", "numpy")}
     head = {"made_with": made_with, "confidence": CONFIDENCE, "aggregates": AGGREGATES, "thresholds": THRESHOLDS}
     cases = [figures(case) for case in range(len(SHAPES))]

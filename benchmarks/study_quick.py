@@ -28,7 +28,7 @@ import torch as th
 from benchmarks import known_q, reliability
 from benchmarks.measure import RESULTS, save
 from benchmarks.planted_faults import FAULTS
-from sb3_have.benchmark.machine import machine
+from sb3_have.benchmark.provenance import machine
 
 SEEDS = (0, 1, 2, 3)
 # Number of seeds that learn to drive

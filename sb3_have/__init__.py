@@ -14,8 +14,7 @@ from sb3_have import envs as envs  # registers the environments
 if TYPE_CHECKING:
     from sb3_have.checkpoint import ResumableCheckpointCallback, load_checkpoint, save_checkpoint
     from sb3_have.common.buffers import ModalityReplayBuffer
-    from sb3_have.evaluation.evaluation import evaluate
-    from sb3_have.evaluation.recording import Recording, record_episode
+    from sb3_have.evaluation import Recording, evaluate, record_episode
     from sb3_have.export import export_onnx, export_safetensors, load_policy
     from sb3_have.have import HAVESAC, DeepMDPCallback, ModalityWeightsCallback, MultiModalCritic, MultiModalPolicy
 
@@ -47,14 +46,14 @@ _MODULES = {
     "ModalityWeightsCallback": "have",
     "MultiModalCritic": "have",
     "MultiModalPolicy": "have",
-    "Recording": "evaluation.recording",
+    "Recording": "evaluation",
     "ResumableCheckpointCallback": "checkpoint",
-    "evaluate": "evaluation.evaluation",
+    "evaluate": "evaluation",
     "export_onnx": "export",
     "export_safetensors": "export",
     "load_checkpoint": "checkpoint",
     "load_policy": "export",
-    "record_episode": "evaluation.recording",
+    "record_episode": "evaluation",
     "save_checkpoint": "checkpoint",
 }
 _PACKAGES = ("checkpoint", "common", "evaluation", "export", "have", "plotting", "sensors")

@@ -1,4 +1,4 @@
-"""Results of a benchmark that never ran, small enough to be worked out by hand."""
+"""Made-up results of a benchmark, small enough to compute by hand."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ STEPS, STD, EPISODES = 2000, 30.0, 2
 
 
 def moments(distance: float, episodes: int = EPISODES) -> dict[str, Any]:
-    told = {"return_mean": distance / 10 - 5, "return_std": STD / 10, "distance_mean": distance, "distance_std": STD}
-    return {**told, "episodes": episodes}
+    values = {"return_mean": distance / 10 - 5, "return_std": STD / 10, "distance_mean": distance, "distance_std": STD}
+    return {**values, "episodes": episodes}
 
 
 def each(runs: Runs) -> list[tuple[dict[str, Any], float]]:
-    """Method, seed and weather of each score, and the score."""
+    """Every score with its method, seed and weather."""
     return [
         ({"method": method, "seed": seed, "weather": weather}, distance)
         for method, seeds in runs.items()
@@ -48,16 +48,16 @@ def scaled(runs: Runs, share: float) -> Runs:
 
 
 def run_rows(runs: Runs = DISTANCES, **settings: Any) -> Rows:
-    told = {"steps": STEPS, "parameters": 1234, "minutes": 10.0, "machine": "a machine", "versions": "torch 2"}
+    common = {"steps": STEPS, "parameters": 1234, "minutes": 10.0, "machine": "a machine", "versions": "torch 2"}
     return [
-        {"method": method, "seed": seed, **told, "settings": json.dumps({"gamma": 0.9, "name": method, **settings})}
+        {"method": method, "seed": seed, **common, "settings": json.dumps({"gamma": 0.9, "name": method, **settings})}
         for method, seeds in runs.items()
         for seed in seeds
     ]
 
 
 def weight_rows(weights: Mapping[int, Sequence[float]], method: str = "have", weather: str = NIGHT) -> Rows:
-    """Weights of rgb by seed, a number for each step."""
+    """Rows for the weights of rgb by seed, one number per step."""
     key = {"method": method, "weather": weather, "episode_seed": 7}
     return [
         {**key, "seed": seed, "t": t, "modality": modality, "weight": weight, "return_so_far": float(t)}
@@ -68,7 +68,7 @@ def weight_rows(weights: Mapping[int, Sequence[float]], method: str = "have", we
 
 
 def failure_rows(kept: Mapping[str, Mapping[int, tuple[float, float]]], modality: str = "rgb") -> Rows:
-    """Distances without and with a black picture, by method and seed; the return is distance / 10 - 5."""
+    """Rows for distances without and with a black image, by method and seed; the return is distance / 10 - 5."""
     rows = []
     for method, seeds in kept.items():
         for seed, (healthy, black) in seeds.items():

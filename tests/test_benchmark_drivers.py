@@ -1,4 +1,4 @@
-"""Drivers that did not learn: over the agents' episodes, in a file that a report reads."""
+"""Untrained drivers: in the episodes of the methods, in a file that a report reads."""
 
 from pathlib import Path
 
@@ -45,5 +45,5 @@ def test_drivers_of_a_grid(tmp_path: Path) -> None:
 def test_grid_of_another_environment_is_refused(tmp_path: Path) -> None:
     (tmp_path / "own.yml").write_text("fake_drive:FakeDrive-v0: {policy: MultiInputPolicy}")
     grid = read_grid(write_grid(tmp_path, methods=["own.yml"], env="fake_drive:FakeDrive-v0", hyperparams={}))
-    with pytest.raises(ValueError, match="HighwayVision-v0 alone, not fake_drive:FakeDrive-v0"):
+    with pytest.raises(ValueError, match="need HighwayVision-v0, and the grid's env is fake_drive:FakeDrive-v0"):
         drivers.drive(grid)

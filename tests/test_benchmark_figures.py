@@ -1,4 +1,4 @@
-"""Figures of a benchmark: what is drawn is what the runs wrote."""
+"""Figures of a benchmark: they show what the runs wrote."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.text import Text
 
-from sb3_have.benchmark import breakdown, figures, tables
+from sb3_have.benchmark import figures, tables
 from sb3_have.benchmark.reading import DISTANCE, RETURN, Results
 
 
@@ -66,7 +66,7 @@ def test_learning_curves_are_means_of_weathers_with_the_range_of_seeds(results: 
     assert points(line(distance, "have (2)")) == [(1000, 111.25), (2000, 222.5)]
     assert points(line(distance, "sac (2)")) == [(1000, 75), (2000, 150)]
     assert points(line(ret, "have (2)"))[1][1] == pytest.approx(17.25)
-    (bands,) = distance.collections  # of the reference alone
+    (bands,) = distance.collections  # only the reference has a band
     band = np.asarray(bands.get_paths()[0].vertices, float)
     assert {(float(x), float(y)) for x, y in band} == {(1000, 85), (1000, 137.5), (2000, 170), (2000, 275)}
     assert to_hex(line(distance, "have (2)").get_color()) == "#000000"
@@ -74,7 +74,7 @@ def test_learning_curves_are_means_of_weathers_with_the_range_of_seeds(results: 
 
 def test_learning_curves_leave_out_seeds_that_lag_behind(tmp_path: Path) -> None:
     rows = evaluations({"have": {0: (100, 200)}}) + evaluations({"have": {1: (1000, 2000)}}, {1000: 1.0})
-    rows += evaluations({"have": {0: (999,)}}, {3000: 1.0})  # not yet in every weather
+    rows += evaluations({"have": {0: (999,)}}, {3000: 1.0})  # not in every weather yet
     figure = figures.plot_progress(read(tmp_path, evaluations=rows))
     assert points(line(panel(figure, "distance"), "have (1)")) == [(1000, 75), (2000, 150)]
     assert not panel(figure, "distance").collections  # a single seed has no band
@@ -87,7 +87,7 @@ def test_learning_curves_of_many_methods_share_the_reference(tmp_path: Path) -> 
     drawn = [[str(line.get_label()) for line in axis.get_lines()] for axis in figure.axes]
     assert [len(names) for names in drawn] == [8, 8, 3, 3] and all("have (1)" in names for names in drawn)
     (bottom, top), *_ = [axis.get_ylim() for axis in figure.axes if "distance" in axis.get_ylabel()]
-    assert bottom == 0 and top > 9, "those of the second row are no less in reach"
+    assert bottom == 0 and top > 9, "the panels of the second row share the axis"
 
 
 def test_drivers_are_levels_unless_far_above(tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ def test_drivers_are_levels_unless_far_above(tmp_path: Path) -> None:
     axis = panel(figure, "distance")
     assert {y for _, y in points(line(axis, "random"))} == {50}
     assert axis.get_title() == "above: IDM 2134" and axis.get_ylim()[1] < 400
-    drivers[0] |= moments(350)  # above the curves, by little
+    drivers[0] |= moments(350)  # slightly above the curves
     figure = figures.plot_progress(read(tmp_path, evaluations=evaluations(), drivers=drivers[:1]))
     assert panel(figure, "distance").get_ylim()[1] > 350
 
@@ -132,7 +132,7 @@ def test_profiles_fall_at_the_scores(results: Results) -> None:
     axis = figures.plot_profiles(results).axes[0]
     drawn = line(axis, "have")
     assert drawn.get_drawstyle() == "steps-post"
-    assert drawn.get_marker() == "o" and line(axis, "sac").get_marker() == "D", "told apart without colours"
+    assert drawn.get_marker() == "o" and line(axis, "sac").get_marker() == "D", "distinguishable without colours"
     shares = dict(points(drawn))
     assert [shares[x] for x in (0, 140, 150, 190, 200, 250, 300)] == [1, 1, 0.75, 0.5, 0.5, 0.25, 0]
 
@@ -165,11 +165,11 @@ def test_weights_over_an_episode(tmp_path: Path) -> None:
 def test_failure_bars(tmp_path: Path) -> None:
     rows = failure_rows({"have": {0: (100.0, 60.0), 1: (200.0, 110.0)}, "sac": {0: (60.0, 150.0)}})
     rows += [row for row in failure_rows({"sac": {0: (60.0, 45.0)}}, "event") if row["kind"] == "black"]
-    table = breakdown.failure_table(read(tmp_path, final=final(), failures=rows))
+    table = tables.failure_table(read(tmp_path, final=final(), failures=rows))
     figure = figures.plot_failures(table, RETURN)
     rgb, event = panel(figure, "rgb fails"), panel(figure, "event fails")
     assert bars(rgb) == {"#888888": [1, 10], "#000000": [10, 3.5]}
-    assert bars(event) == {"#888888": [1, -0.5]}, "have was not driven so"
+    assert bars(event) == {"#888888": [1, -0.5]}, "have has no event failure"
     np.testing.assert_allclose(whiskers(rgb), [[5, 15], [1, 6]])
     assert [tick.get_text() for tick in rgb.get_xticklabels()] == ["none", "rgb black"]
     (legend,) = figure.legends
@@ -179,7 +179,7 @@ def test_failure_bars(tmp_path: Path) -> None:
 def test_failure_bars_stand_over_their_kind(tmp_path: Path) -> None:
     black = failure_rows({"have": {0: (100.0, 60.0)}, "sac": {0: (100.0, 70.0)}})
     noise = [row | moments(row["distance_mean"] - 30, 1) | {"kind": "noise"} for row in black if row["kind"] == "black"]
-    table = breakdown.failure_table(read(tmp_path, final=final(), failures=[*black, *noise]))
+    table = tables.failure_table(read(tmp_path, final=final(), failures=[*black, *noise]))
     (axis,) = figures.plot_failures(table, DISTANCE).axes
     assert [tick.get_text() for tick in axis.get_xticklabels()] == ["none", "rgb black", "rgb noise"]
     sac, have = (group.patches for group in axis.containers if isinstance(group, BarContainer))
@@ -194,7 +194,7 @@ def test_methods_look_different_and_always_the_same() -> None:
     assert len(set(looks)) == len(looks)
     for other, style in figures.STYLES.items():
         alike = [name for name, look in figures.STYLES.items() if look[:2] == style[:2] and name != other]
-        assert not alike, f"{other} is told from {alike} by its marker only"
+        assert not alike, f"{other} differs from {alike} in its marker only"
     core = [figures.STYLES[name] for name in ("rgb", "event", "sac", "deepmdp", "gve-wide", "lve")]
     assert len({style.marker for style in core}) == len({style.hatch for style in core}) == len(core), "without colour"
     assert figures.style("my-method") == figures.style("my-method") != figures.style("have")

@@ -1,4 +1,4 @@
-"""A benchmark with Ray for real: runs that are stopped and killed are all there at last, once."""
+"""A benchmark on Ray: runs that are stopped and killed are all finished in the end, once."""
 
 import os
 import signal
@@ -29,7 +29,7 @@ from sb3_have.train import algorithms
 def wait_until(happened: Callable[[], bool], process: subprocess.Popen[bytes], seconds: float = 240.0) -> None:
     start = time.monotonic()
     while not happened():
-        assert process.poll() is None, f"it ended by itself with code {process.returncode}"
+        assert process.poll() is None, f"the process ended with code {process.returncode}"
         assert time.monotonic() - start < seconds
         time.sleep(0.05)
 
@@ -39,7 +39,7 @@ def processes_of_session(session: int) -> list[int]:
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:
             fields = stat.read_text().rpartition(")")[2].split()
-        except OSError:  # it has just ended
+        except OSError:  # the process has just ended
             continue
         if int(fields[3]) == session:
             found.append(int(stat.parent.name))
@@ -48,7 +48,7 @@ def processes_of_session(session: int) -> list[int]:
 
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the processes to kill in /proc")
 def test_benchmark_survives_sigterm_sigkill_and_a_dead_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With Ray for real: stopped in order, then one worker killed, then everything; at last it is all there, once."""
+    """Stop the benchmark, kill one worker, kill everything; in the end every run is finished, once."""
     pytest.importorskip("ray")
     config = {"env_wrapper": "slow_drive.SlowUntil"}
     grid = make_grid(tmp_path, config, seeds=[0], steps=150, save_freq=10, eval_freq=100)
@@ -56,7 +56,8 @@ def test_benchmark_survives_sigterm_sigkill_and_a_dead_worker(tmp_path: Path, mo
     log = tmp_path / "log.txt"
     command = [sys.executable, "-m", "sb3_have.benchmark", "run", "mine.yml", "--workers", "2"]
     command += ["--runs", str(runs), "--results", str(results)]
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent), "HURRY": str(hurry)}
+    paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "HURRY": str(hurry)}
     started: list[subprocess.Popen[bytes]] = []
 
     def start() -> subprocess.Popen[bytes]:
@@ -111,6 +112,6 @@ def test_benchmark_survives_sigterm_sigkill_and_a_dead_worker(tmp_path: Path, mo
         model = algorithms()[job.algo].load(runs / job.name / "model.zip")
         rows = read(results, "episodes").query("method == @job.method and weather == 'slow'")
         driven = evaluate_episodes(model, ENV_ID, ["slow"], 3, FINAL_SEED)
-        np.testing.assert_allclose(rows["return"], driven["return"], atol=1e-3, err_msg="it is the model that is kept")
+        np.testing.assert_allclose(rows["return"], driven["return"], atol=1e-3, err_msg="of the saved model")
     curve = read(results, "evaluations")
     assert not curve.duplicated(["method", "weather", "step"]).any()

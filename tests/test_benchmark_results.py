@@ -1,4 +1,4 @@
-"""Results of a benchmark: whole at any moment, and of one setting."""
+"""Results of a benchmark: complete at any moment, and never of mixed settings."""
 
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ def test_results_of_other_settings_are_refused(tmp_path: Path) -> None:
     job = make_grid(tmp_path).jobs()[0]
     assert run_job(job, runs)
     merge(results, job, collect(job, runs / job.name))
-    for changes, told in [
+    for changes, message in [
         ({"config": {"gamma": 0.5}}, "gamma is new"),
         ({"config": {"batch_size": 5}}, "batch_size: 4, now 5"),
         ({"config": {"env_kwargs": {"weather": "slow"}}}, "env_kwargs.weather: 'fast', now 'slow'"),
@@ -28,10 +28,10 @@ def test_results_of_other_settings_are_refused(tmp_path: Path) -> None:
         ({"weathers": ["slow"]}, "weathers: ['fast', 'slow'], now ['slow']"),
     ]:
         other = make_grid(tmp_path, **changes).jobs()[0]  # type: ignore[arg-type]
-        with pytest.raises(GridError, match="holds gve-0 with other settings") as error:
+        with pytest.raises(GridError, match="contains gve-0 with other settings") as error:
             is_finished(results, other)
-        assert f"({told})" in str(error.value)
-    assert not is_finished(results, make_grid(tmp_path, config={"gamma": 0.5}).jobs()[1]), "another run, not yet there"
+        assert f"({message})" in str(error.value)
+    assert not is_finished(results, make_grid(tmp_path, config={"gamma": 0.5}).jobs()[1]), "another run"
     changed = make_grid(tmp_path, config={"gamma": 0.5}).jobs()[0]
     with pytest.raises(ValueError, match="other settings"):
         run_job(changed, runs)
@@ -69,20 +69,8 @@ def test_merge_that_is_cut_off_leaves_no_finished_run(tmp_path: Path, monkeypatc
             merge(results, second, tables[second.name])
         assert is_finished(results, first) and not is_finished(results, second)
         after = {name: text for name, text in contents(results).items() if not name.endswith(".partial")}
-        assert all(after[name].startswith(before[name]) for name in before), "what was there is whole"
+        assert all(after[name].startswith(before[name]) for name in before), "earlier rows are complete"
     monkeypatch.setattr(results_module, "write_atomically", whole)
     merge(results, second, tables[second.name])
     assert is_finished(results, second)
     assert not read_results([results])["final"].duplicated().any()
-
-
-def test_file_is_whole_or_as_it_was(tmp_path: Path) -> None:
-    def write_half(path: Path) -> None:
-        path.write_text("ha")
-        raise OSError("no space left")
-
-    path = tmp_path / "rows.csv"
-    path.write_text("before")
-    with pytest.raises(OSError, match="no space"):
-        files.write_atomically(path, write_half)
-    assert path.read_text() == "before"

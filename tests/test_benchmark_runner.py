@@ -1,4 +1,4 @@
-"""Runs of a benchmark side by side: in order, none twice, none lost, and all told to stop."""
+"""Runs of a benchmark side by side: in order, none twice, none lost, and all stopped on request."""
 
 import os
 import signal
@@ -24,7 +24,7 @@ from sb3_have.train import algorithms
 
 @pytest.fixture
 def unexamined(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For runs that only pretend: their results are of no interest."""
+    """Ignore the results of runs that do nothing."""
     numbers = {"return_mean": [1.0], "distance_mean": [1.0]}
     tables = {"final": pd.DataFrame(numbers), "runs": pd.DataFrame({"minutes": [1.0]})}
     monkeypatch.setattr(runner_module, "collect", lambda job, folder: tables)
@@ -42,7 +42,7 @@ def test_results_of_a_grid(tmp_path: Path) -> None:
     assert list(zip(final["method"], final["seed"], strict=True)) == [run for run in of_runs for _ in range(2)]
     assert list(final["weather"]) == ["slow", "fast"] * 4
     assert (final["step"] == 30).all() and (final["episodes"] == 3).all()
-    # each drives the same episodes, and the statistics are theirs
+    # Every run has the same episodes, and the statistics are theirs
     seeds = episodes.groupby(["method", "seed"])["episode_seed"].agg(tuple)
     assert len(set(seeds)) == 1 and len(set(seeds.iloc[0])) == 6
     grouped = episodes.groupby(["method", "seed", "weather"], sort=False)
@@ -53,7 +53,7 @@ def test_results_of_a_grid(tmp_path: Path) -> None:
 
     curve = read(results, "evaluations")
     assert list(curve["step"].unique()) == [10, 20, 30]
-    assert list(curve["episodes"].unique()) == [1, 3], "of the last step there is the final evaluation alone"
+    assert list(curve["episodes"].unique()) == [1, 3], "the last point is the final evaluation"
     assert len(curve) == 4 * 2 * 3
 
     weights = read(results, "weights")
@@ -62,11 +62,11 @@ def test_results_of_a_grid(tmp_path: Path) -> None:
     for key, rows in weights.groupby(["seed", "weather"]):
         first = episodes.set_index(["method", "seed", "weather"]).loc[[("have", *key)]].iloc[0]
         assert (rows["episode_seed"] == first["episode_seed"]).all()
-        assert list(rows["t"]) == [t for t in range(first["steps"]) for _ in range(2)]
+        assert list(rows["t"]) == [t for t in range(0, first["steps"], 5) for _ in range(2)]
         assert rows["return_so_far"].iloc[0] == 0 and rows["return_so_far"].is_monotonic_increasing
-        gained = np.diff(rows["return_so_far"].iloc[::2])
-        # the policy is deterministic and sees this environment change little
-        np.testing.assert_allclose(first["return"] - rows["return_so_far"].iloc[-1], gained.mean(), rtol=0.2)
+        # The untrained policy gains about the same in every step
+        so_far = rows["return_so_far"].to_numpy()[::2]
+        np.testing.assert_allclose(so_far, first["return"] * rows["t"][::2] / first["steps"], rtol=0.1)
 
     failures = read(results, "failures")
     of_run = failures.query("method == 'gve' and seed == 0")
@@ -93,7 +93,7 @@ def test_results_of_a_grid(tmp_path: Path) -> None:
     assert table["parameters"][0] == everything - of_target > 0
     assert not [*runs.glob("*/checkpoint*")] and len([*runs.glob("*/model.zip")]) == 4
 
-    # and again: nothing is left to do
+    # Nothing is left to do for a second runner
     before = contents(results)
     again = Runner(grid.jobs(), runs, results)
     assert again.is_done and again.run(LocalPool(lambda job: pytest.fail("it was finished"))) == FINISHED
@@ -102,7 +102,7 @@ def test_results_of_a_grid(tmp_path: Path) -> None:
     assert contents(results).keys() == before.keys()
     for name in before:
         lines, lines_before = (sorted(text.splitlines()) for text in (contents(results)[name], before[name]))
-        assert lines == lines_before, "a run's rows take the place of those it had"
+        assert lines == lines_before, "a run's rows replace its old ones"
 
 
 def test_work_goes_seed_by_seed_on_all_workers(tmp_path: Path, unexamined: None) -> None:
@@ -127,11 +127,11 @@ def test_run_that_dies_resumes_from_its_checkpoint(tmp_path: Path, monkeypatch: 
     assert Runner(grid.jobs(), runs, results).run(LocalPool(lambda job: run_job(job, runs))) == FINISHED
     assert deaths and {path.name for path in (runs / "gve-0").glob("log-*")} == {"log-0", "log-20"}
     curve = read(results, "evaluations").query("method == 'gve'")
-    assert list(curve["step"]) == [10, 10, 20, 20, 30, 30], "no evaluation is there twice"
+    assert list(curve["step"]) == [10, 10, 20, 20, 30, 30], "no evaluation is repeated"
     assert not (runs / "gve-0" / "traceback.txt").exists()
 
 
-def test_run_that_dies_again_is_left_and_told(
+def test_run_that_keeps_failing_is_given_up(
     tmp_path: Path, unexamined: None, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def work(job: Job) -> bool:
@@ -148,7 +148,7 @@ def test_run_that_dies_again_is_left_and_told(
     assert "out of luck" in path.read_text()
 
 
-def test_run_that_others_stop_is_told(tmp_path: Path, unexamined: None) -> None:
+def test_run_that_is_stopped_from_outside(tmp_path: Path, unexamined: None) -> None:
     runner = Runner(make_grid(tmp_path).jobs()[:1], tmp_path / "runs", tmp_path, retries=1)
     assert runner.run(LocalPool(lambda job: False)) == FAILED
     assert "stopped from outside" in (tmp_path / "runs" / "gve-0" / "traceback.txt").read_text()
@@ -169,13 +169,17 @@ def test_stop_asks_all_runs_to_save(
     assert runner.run(pool) == STOPPED
     assert pool.stopped and pool.started == ([] if cause == "time limit" else ["gve-0", "have-0"])
     assert not pool.running and not runner.failed
-    assert "the same command goes on" in capsys.readouterr().out
+    assert "the same command resumes" in capsys.readouterr().out
     assert signal.getsignal(signal.SIGTERM) == before
 
 
-def test_missing_ray_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ray", None)
+@pytest.mark.parametrize("missing", ["ray", "pydantic"])
+def test_missing_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
     make_grid(tmp_path)
+    monkeypatch.setitem(sys.modules, missing, None)
+    if missing == "pydantic":
+        for name in ("runner", "pool", "results", "stages", "grid"):
+            monkeypatch.delitem(sys.modules, f"sb3_have.benchmark.{name}")
     where = ["--runs", str(tmp_path / "runs"), "--results", str(tmp_path / "results")]
     with pytest.raises(SystemExit, match=r'pip install "sb3_have\[benchmark\]"'):
         main(["run", str(tmp_path / "mine.yml"), *where])
@@ -186,4 +190,4 @@ def test_wrong_command_lines(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     assert main(["run", str(tmp_path / "gone.yml")]) == FAILED and "gone.yml" in capsys.readouterr().err
     make_grid(tmp_path)
     arguments = ["run", str(tmp_path / "mine.yml"), "--results", str(tmp_path / "results")]
-    assert main([*arguments, "--only", "lve"]) == FAILED and "mine has no 'lve'" in capsys.readouterr().err
+    assert main([*arguments, "--only", "lve"]) == FAILED and "--only: unknown name 'lve'" in capsys.readouterr().err

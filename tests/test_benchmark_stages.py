@@ -1,14 +1,13 @@
-"""A run of a benchmark: every stage once, and taken up where it was."""
+"""A run of a benchmark: every stage once, and resumed where it was."""
 
-import io
 import os
 import signal
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pandas as pd
 import pytest
 from fake_drive import ENV_ID
@@ -22,7 +21,7 @@ from sb3_have.benchmark.stages import collect, run_job
 from sb3_have.checkpoint import newest_checkpoint
 from sb3_have.evaluation import callback
 from sb3_have.evaluation.callback import EVALUATION_SEED
-from sb3_have.evaluation.episodes import Task
+from sb3_have.evaluation.episodes import Step, Task
 from sb3_have.evaluation.evaluation import episode_tasks
 from sb3_have.train import Run
 
@@ -31,46 +30,36 @@ def test_evaluation_seeds_are_not_those_of_training() -> None:
     assert FINAL_SEED != EVALUATION_SEED and min(FINAL_SEED, EVALUATION_SEED) > 100_000
 
 
-def test_stages_go_on_where_they_were(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each in one go; what a stage has from elsewhere is not driven again."""
+def test_stages_resume_where_they_were(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each stage is driven as a whole, once; what another stage has is not driven again."""
     job = make_grid(tmp_path, failures=FAILURES).jobs()[1]
-    driven: list[Any] = []
-    drive, watch = stages._drive, stages.weights_of_episodes
+    driven: list[list[tuple[str, str | None]]] = []
+    drive = stages._drive
 
-    def counted(what: Callable[..., Any], job: Job, model: Any, tasks: Sequence[Task]) -> Any:
+    def counted(job: Job, model: Any, tasks: Sequence[Task], *args: Any) -> Any:
         if len(driven) == stop:
             raise KeyboardInterrupt
         failures = [task.env_wrapper.keywords.get("failure") or {} for task in tasks]  # type: ignore[union-attr]
-        told = [(task.weather, case.get("kind")) for task, case in zip(tasks, failures, strict=True)]
-        driven.append((what.__name__, told))
-        return what(job, model, tasks)
+        driven.append([(task.weather, case.get("kind")) for task, case in zip(tasks, failures, strict=True)])
+        return drive(job, model, tasks, *args)
 
-    monkeypatch.setattr(stages, "_drive", partial(counted, drive))
-    monkeypatch.setattr(stages, "weights_of_episodes", partial(counted, watch))
-    for stop in (0, 1, 2):  # noqa: B007 (the function above reads it)
+    monkeypatch.setattr(stages, "_drive", counted)
+    for stop in (0, 1):  # noqa: B007 (the function above reads it)
         with pytest.raises(KeyboardInterrupt):
             run_job(job, tmp_path)
-    episodes = tmp_path / job.name / "final-30" / "episodes.csv"
-    whole = episodes.read_text()
-    rows = whole.splitlines(keepends=True)
-    episodes.write_text("".join(row for row in rows if not row.startswith("fast")))
     stop = 99
     assert run_job(job, tmp_path)
-    # driven in a smaller batch, the actions' last bits may differ
-    pd.testing.assert_frame_equal(pd.read_csv(episodes), pd.read_csv(io.StringIO(whole)), rtol=0, atol=2e-4)
-    slow, fast = [("slow", None)], [("fast", None)]
+    whole = [("slow", None)] * 3 + [("fast", None)] * 3
     broken = [(weather, kind) for weather in ("slow", "fast") for kind in ("black", "black", "overexposure")]
-    assert driven == [
-        ("_drive", slow * 3 + fast * 3),
-        ("weights_of_episodes", slow + fast),
-        ("_drive", fast * 3),
-        ("_drive", [case for case in broken for _ in range(2)]),
-    ]
-    assert run_job(job, tmp_path) and len(driven) == 4
+    assert driven == [whole, [case for case in broken for _ in range(2)]]
+    assert run_job(job, tmp_path) and len(driven) == 2
+    # Other questions are answered by the same model
+    more = make_grid(tmp_path, failures={**FAILURES, "kinds": ["black"]}, final_episodes=4).jobs()[1]
+    assert run_job(more, tmp_path) and [len(tasks) for tasks in driven[2:]] == [8, 8]
 
 
 def test_stages_do_not_depend_on_the_number_of_environments(tmp_path: Path) -> None:
-    """A model sees other observations under each failure, and its actions are in the return."""
+    """The returns depend on the actions, which differ under each failure."""
     files = {}
     for eval_envs in (1, 5):
         job = make_grid(tmp_path, failures=FAILURES, eval_envs=eval_envs).jobs()[1]
@@ -87,7 +76,24 @@ def test_stages_do_not_depend_on_the_number_of_environments(tmp_path: Path) -> N
     assert files[1]["failures"]["return_mean"].nunique() == 8
 
 
-def test_failures_may_be_asked_for_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_weights_belong_to_their_episode() -> None:
+    """The first environment drives another episode, the third none, and the fourth is between two rows."""
+
+    class Model:
+        def modality_weights(self, observations: np.ndarray) -> dict[str, np.ndarray]:
+            return {"rgb": observations, "depth": 1 - observations}
+
+    tasks = [Task("slow", 1), Task("slow", 2), Task("fast", 3), Task("fast", 4)]
+    numbers, t, returns = [1, 2, None, 0], np.array([5, 5, 5, 6]), np.array([2.0, 1.5, 3.0, 4.0])
+    nothing: Any = []
+    step = Step(numbers, t, returns, np.array([0.5, 0.25, 0.5, 0.5]), *[nothing] * 5)
+    rows: list[dict[str, Any]] = []
+    stages._record_weights(Model(), tasks, range(0, 4, 2), rows, step)
+    key = {"weather": "fast", "episode_seed": 3, "t": 5, "return_so_far": 1.5}
+    assert rows == [{**key, "modality": "rgb", "weight": 0.25}, {**key, "modality": "depth", "weight": 0.75}]
+
+
+def test_failures_may_be_added_later(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     runs, results = tmp_path / "runs", tmp_path / "results"
     job = make_grid(tmp_path).jobs()[0]
     assert run_job(job, runs)
@@ -96,14 +102,14 @@ def test_failures_may_be_asked_for_later(tmp_path: Path, monkeypatch: pytest.Mon
 
     later = make_grid(tmp_path, failures=FAILURES).jobs()[0]
     assert not is_finished(results, later)
-    monkeypatch.setattr(Run, "train", lambda *args: pytest.fail("it is trained"))
+    monkeypatch.setattr(Run, "train", lambda *args: pytest.fail("the model is trained already"))
     assert run_job(later, runs)
     merge(results, later, collect(later, runs / job.name))
     assert is_finished(results, later) and is_finished(results, job)
     assert len(read(results, "failures")) == 8
 
 
-def test_run_begun_by_train_is_taken_up(tmp_path: Path) -> None:
+def test_run_begun_by_train_is_resumed(tmp_path: Path) -> None:
     job = make_grid(tmp_path, save_freq=0).jobs()[0]
     config = {**TINY, "value_estimation": "gve", "n_timesteps": 7}
     options: dict[str, Any] = {"eval_freq": 10, "eval_episodes": 1, "weathers": ("slow", "fast"), "save_freq": 0}
@@ -124,13 +130,13 @@ def test_checkpoint_stays_only_if_asked_for(tmp_path: Path) -> None:
     assert run_job(long, tmp_path)
     assert newest_checkpoint(folder) is None
     assert {path.name for path in folder.glob("log-*")} == {"log-0", "log-30"}
-    with pytest.raises(ValueError, match="gone on to step 40 from step 30"):
+    with pytest.raises(ValueError, match="trained on to step 40, from the 30"):
         run_job(short, tmp_path)
     with pytest.raises(ValueError, match="no checkpoint to resume from"):
         run_job(make_grid(tmp_path, steps=50).jobs()[0], tmp_path)
 
 
-def test_training_past_the_grid_is_not_driven(tmp_path: Path) -> None:
+def test_training_past_the_grid_is_refused(tmp_path: Path) -> None:
     job = make_grid(tmp_path).jobs()[0]
     run = Run(job.config, ENV_ID, tmp_path / job.name, eval_freq=0)
     run.train(31)
@@ -139,8 +145,8 @@ def test_training_past_the_grid_is_not_driven(tmp_path: Path) -> None:
     assert not (tmp_path / job.name / "final-30").exists()
 
 
-def test_training_that_ends_a_rollout_late_is_driven(tmp_path: Path) -> None:
-    """As when it was stopped at an odd step, with an update every second one."""
+def test_training_may_end_a_rollout_late(tmp_path: Path) -> None:
+    """As after a stop at an odd step, with an update every second step."""
     job = make_grid(tmp_path, {"train_freq": 2}).jobs()[0]
     run = Run(job.config, ENV_ID, tmp_path / job.name, eval_freq=0)
     run.train(1)  # two steps, as rollouts are whole
@@ -167,7 +173,7 @@ def test_unfinished_checkpoint_is_removed(tmp_path: Path) -> None:
 
 
 def test_parameters_are_those_that_are_trained() -> None:
-    """A policy has DeepMDP's heads in any case; where that loss is off, they get no gradient."""
+    """DeepMDP's heads count only if that loss is on."""
     kwargs: dict[str, Any] = {"policy_kwargs": TINY["policy_kwargs"], "buffer_size": 10}
     sac, deepmdp = (HAVESAC("MultiInputPolicy", gym.make(ENV_ID), auxiliary=a, **kwargs) for a in (None, "deepmdp"))
     heads = sum(parameter.numel() for parameter in sac.policy.auxiliary.parameters())
@@ -177,7 +183,7 @@ def test_parameters_are_those_that_are_trained() -> None:
 
 
 def test_final_seed_of_a_grid(tmp_path: Path) -> None:
-    """A search drives other episodes than the tables, and its runs are not taken for theirs."""
+    """A search has other episodes than the tables, and its runs are not mistaken for theirs."""
     ours, theirs = make_grid(tmp_path, final_seed=7).jobs()[0], make_grid(tmp_path).jobs()[0]
     run_job(ours, tmp_path / "runs")
     episodes = pd.read_csv(tmp_path / "runs" / ours.name / "final-30" / "episodes.csv")

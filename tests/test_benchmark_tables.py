@@ -1,4 +1,4 @@
-"""Tables of a benchmark: worked out by hand."""
+"""Tables of a benchmark, against values computed by hand."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ from benchmark_results import (
 )
 from matplotlib.figure import Figure
 
-from sb3_have.benchmark import breakdown, tables
+from sb3_have.benchmark import tables
 from sb3_have.benchmark.reading import DISTANCE, RETURN, Results
 from sb3_have.benchmark.report import write_report
+from sb3_have.evaluation.evaluation import markdown_table
 
 
 @pytest.fixture
@@ -35,7 +36,7 @@ def results(tmp_path: Path) -> Results:
 
 @pytest.fixture
 def words_only(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Pictures are not drawn, which takes most of a report's time."""
+    """Skip drawing, which takes most of a report's time."""
     monkeypatch.setattr(Figure, "savefig", lambda figure, path, **kwargs: Path(path).touch())
 
 
@@ -95,10 +96,10 @@ def test_driver_without_all_weathers_has_no_total(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("words_only")
-def test_drivers_are_told_beside_the_methods(tmp_path: Path) -> None:
+def test_drivers_are_reported_beside_the_methods(tmp_path: Path) -> None:
     drivers = [{"driver": "IDM", "weather": weather, **moments(2134)} for weather in (NOON, NIGHT)]
     report = write_report(write(tmp_path / "a", final=final(), drivers=drivers)).read_text()
-    assert "- Drivers that did not learn: `IDM` 2134 m.\n" in report
+    assert "- Untrained drivers: `IDM` 2134 m.\n" in report
 
 
 def test_newest_complete_step_counts(tmp_path: Path) -> None:
@@ -112,8 +113,8 @@ def test_newest_complete_step_counts(tmp_path: Path) -> None:
 
 @pytest.mark.usefixtures("words_only")
 def test_environment_without_distance(tmp_path: Path) -> None:
-    untold = {"distance_mean": None, "distance_std": None}
-    results = read(tmp_path, final=[row | untold for row in final()], evaluations=[r | untold for r in evaluations()])
+    unknown = {"distance_mean": None, "distance_std": None}
+    results = read(tmp_path, final=[row | unknown for row in final()], evaluations=[r | unknown for r in evaluations()])
     assert results.measures == [RETURN]
     report = write_report(tmp_path, tmp_path / "out").read_text()
     assert "D [m]" not in report and "IQM of return" in report and not re.search(r"\bnan\b", report)
@@ -142,7 +143,7 @@ def test_statistics_by_hand(results: Results) -> None:
 
 
 def test_areas_by_hand(tmp_path: Path) -> None:
-    """A run that is not finished, and steps that only one run was evaluated at, are left out."""
+    """Unfinished runs are left out, and steps at which only one run was evaluated."""
     rows = evaluations(shares={1000: 0.5, 2000: 1.0})
     rows += final({"have": {0: (9000.0, 9000.0)}}, step=1500) + final({"have": {2: (9000.0, 9000.0)}}, step=1000)
     results = read(tmp_path, final=final(), evaluations=rows)
@@ -155,7 +156,7 @@ def test_areas_by_hand(tmp_path: Path) -> None:
 
 
 def test_intervals_draw_whole_seeds(tmp_path: Path) -> None:
-    """With single scores drawn, no interval of have's would reach from one seed's mean to another's."""
+    """With single scores, no interval would reach from the lowest seed's mean to the highest one's."""
     runs = {"sac": {0: (100, 200), 1: (140, 160), 2: (150, 150)}, "have": {i: (200 + i, 400 + i) for i in range(3)}}
     sac, have = tables.score_table(read(tmp_path, final=final(runs))).tail(2).to_dict("records")
     assert (have["iqm_lower"], have["iqm_upper"]) == (300, 302)
@@ -177,11 +178,11 @@ def test_no_interval_from_so_few_seeds(tmp_path: Path, seeds: int) -> None:
     text = tables.score_markdown(table, DISTANCE, "have").splitlines()
     assert [part.strip() for part in text[3].split("|")[1:-1]] == ["lve", str(seeds), "170", "0.50"]
     report = write_report(tmp_path, tmp_path / "out").read_text()
-    assert "lve: fewer than 3 seeds, hence no interval" in report and "not known for want of seeds for `lve`" in report
+    assert "lve: fewer than 3 seeds, hence no interval" in report and "unknown for lack of seeds for `lve`" in report
 
 
 def test_minutes_are_those_of_an_ordinary_run(tmp_path: Path) -> None:
-    """A single run on a busy machine tells nothing of the others."""
+    """A single run on a busy machine does not matter."""
     runs = {"have": dict.fromkeys(range(3), (100, 200))}
     rows = [row | {"minutes": minutes} for row, minutes in zip(run_rows(runs), (15.0, 13.0, 130.0), strict=True)]
     (row,) = tables.run_table(read(tmp_path, final=final(runs), runs=rows)).to_dict("records")
@@ -199,7 +200,7 @@ def test_failures_by_hand(tmp_path: Path) -> None:
     # returns 5 -> 1 and 15 -> 6; lve's 5 -> 1 and -1 -> -3
     given = {"have": {0: (100.0, 60.0), 1: (200.0, 110.0)}, "lve": {0: (100.0, 60.0), 1: (40.0, 20.0)}}
     results = read(tmp_path, final=final(), failures=failure_rows(given))
-    table = breakdown.failure_table(results)
+    table = tables.failure_table(results)
     assert list(named(table)) == [(m, case) for m in ("lve", "have") for case in ("none none", "rgb black")]
     sound, have, lve = (named(table)[k] for k in (("have", "none none"), ("have", "rgb black"), ("lve", "rgb black")))
     assert (sound["return_mean"], sound["distance_mean"], sound["distance_kept"], sound["seeds"]) == (10, 150, 1, 2)
@@ -221,7 +222,7 @@ def test_frozen_that_is_black_counts_once(tmp_path: Path) -> None:
     rows += [row | {"kind": "frozen"} for row in rows if row["kind"] == "black"]
     rows[-1] |= moments(75, 1)  # of rgb
     results = read(tmp_path, final=final(), failures=rows)
-    table = breakdown.failure_table(results)
+    table = tables.failure_table(results)
     assert [case for method, case in named(table) if method == "have"] == [
         *("none none", "event black = frozen", "rgb black", "rgb frozen"),
     ]
@@ -232,4 +233,4 @@ def test_frozen_that_is_black_counts_once(tmp_path: Path) -> None:
 
 
 def test_markdown_escapes_and_lines_up() -> None:
-    assert tables.markdown(["a|b", "c"], [["1", "long"]]) == "| a\\|b | c    |\n|------|------|\n| 1    | long |"
+    assert markdown_table(["a|b", "c"], [["1", "long"]]) == "| a\\|b | c    |\n|------|------|\n| 1    | long |"

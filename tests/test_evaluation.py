@@ -1,4 +1,4 @@
-"""Evaluation: every driver meets the same episodes, each is counted once, and models see what they were trained on."""
+"""Evaluation: every driver gets the same episodes, each counts once, and models read what they were trained on."""
 
 import io
 from pathlib import Path
@@ -17,19 +17,17 @@ from stable_baselines3.common.vec_env import (
     SubprocVecEnv,
     VecEnv,
     VecFrameStack,
-    VecNormalize,
     VecTransposeImage,
 )
 
 from sb3_have.envs.drivers import KeepStraightDriver, RandomDriver
-from sb3_have.evaluation.episodes import match_observations
 from sb3_have.evaluation.evaluation import evaluate, evaluate_episodes, format_table
 
 WEATHERS = ("slow", "fast")
 
 
 class Watcher:
-    """Coasts, and notes the shapes it was shown."""
+    """Coasts, and keeps the shapes of its observations."""
 
     def __init__(self, observation_space: gym.Space[Any] | None = None) -> None:
         self.shapes: set[tuple[int, ...]] = set()
@@ -50,7 +48,7 @@ def fake_vec_env(**kwargs: Any) -> VecEnv:
 
 
 class Jerks(gym.Wrapper[Any, Any, Any, Any]):
-    """Rewards the change from the last action, which it keeps as it was given."""
+    """Rewards the change from the last action, and keeps that array without copying it."""
 
     last: np.ndarray | None = None
 
@@ -62,7 +60,7 @@ class Jerks(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def test_environments_may_keep_their_actions() -> None:
-    """The array of one step is not filled again in the next."""
+    """The array of actions is a new one in every step."""
 
     class Alternating(Watcher):
         sign = 1.0
@@ -76,7 +74,7 @@ def test_environments_may_keep_their_actions() -> None:
 
 
 def test_known_answers() -> None:
-    """A coasting car earns its metres: the statistics follow from the episode lengths, seed % 5 + 4."""
+    """A coasting car earns its metres, so the statistics follow from the lengths of the episodes, seed % 5 + 4."""
     frame = evaluate(Watcher(), ENV_ID, WEATHERS, n_episodes=6, seed=3)
     episodes = evaluate_episodes(Watcher(), ENV_ID, WEATHERS, n_episodes=6, seed=3)
     assert list(frame["weather"]) == ["slow", "fast"]
@@ -96,7 +94,7 @@ def test_known_answers() -> None:
     [(2, SubprocVecEnv), (3, SubprocVecEnv), (2, DummyVecEnv), (3, DummyVecEnv), (99, DummyVecEnv)],
 )
 def test_result_does_not_depend_on_the_number_of_environments(n_envs: int, vec_env_cls: Any) -> None:
-    """Taking whichever episodes end first would favour the short ones."""
+    """Counting whichever episodes end first would favour short ones."""
     options: dict[str, Any] = {"weathers": WEATHERS, "n_episodes": 4, "seed": 1}
     one = evaluate_episodes(KeepStraightDriver(3.0), ENV_ID, **options)
     several = evaluate_episodes(KeepStraightDriver(3.0), ENV_ID, **options, n_envs=n_envs, vec_env_cls=vec_env_cls)
@@ -114,7 +112,7 @@ def test_an_environment_takes_the_next_episode_as_soon_as_it_can() -> None:
 
 
 class Recurrent(Watcher):
-    """Pushes harder in every step of an episode, which its state counts."""
+    """Accelerates more in every step of an episode, which its state counts."""
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = False
@@ -138,7 +136,7 @@ def test_same_episodes_for_every_driver_others_in_every_weather() -> None:
     other = evaluate_episodes(KeepStraightDriver(), ENV_ID, WEATHERS, n_episodes=5, seed=7)
     assert list(one["seed"]) == list(other["seed"]) and list(one["steps"]) == list(other["steps"])
     assert one["seed"].is_unique
-    # a weather's episodes do not depend on which others are evaluated beside it
+    # The episodes of a weather do not depend on the other weathers
     alone = evaluate_episodes(RandomDriver(0), ENV_ID, ["fast"], n_episodes=5, seed=7)
     assert list(alone["seed"]) == list(one["seed"][one["weather"] == "fast"])
     again = evaluate_episodes(RandomDriver(0), ENV_ID, WEATHERS, n_episodes=5, seed=8)
@@ -173,7 +171,7 @@ def test_frames_are_stacked_and_transposed_for_the_model(n_stack: int, transpose
     assert watcher.shapes == {(3 * n_stack, 36, 36) if transposed else (36, 36, 3 * n_stack)}
 
 
-def test_driver_without_space_sees_the_bare_environment() -> None:
+def test_driver_without_space_gets_the_bare_environment() -> None:
     watcher = Watcher()
     evaluate(watcher, ENV_ID, ["slow"], n_episodes=1)
     assert watcher.shapes == {(36, 36, 3)}
@@ -197,15 +195,6 @@ def test_wrong_spaces_are_explained() -> None:
         evaluate(only_rgb, ENV_ID, ["slow"], n_episodes=1)
 
 
-def test_normalized_observations_are_refused() -> None:
-    class Normalized(Watcher):
-        def get_vec_normalize_env(self) -> VecNormalize:
-            return VecNormalize(fake_vec_env(), norm_obs_keys=[])
-
-    with pytest.raises(ValueError, match="VecNormalize"):
-        match_observations(fake_vec_env(), Normalized(fake_vec_env().observation_space))
-
-
 @pytest.mark.parametrize("bad", [{"n_episodes": 0}, {"n_envs": 0}, {"weathers": ()}])
 def test_bad_counts(bad: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=">= 1"):
@@ -223,7 +212,7 @@ def test_keep_straight_driver_holds_its_speed() -> None:
     assert speed == pytest.approx(25.0, abs=0.01)
 
 
-def test_drivers_say_what_they_need() -> None:
+def test_drivers_without_their_infos() -> None:
     with pytest.raises(RuntimeError, match="read_infos"):
         KeepStraightDriver().predict(None)
     with pytest.raises(KeyError, match="speed"):
@@ -265,7 +254,7 @@ def test_the_progress_bar_is_seen_within_that_of_a_training(monkeypatch: pytest.
     terminal = io.StringIO()
     console = Console(file=terminal, stderr=True, force_terminal=True)
     monkeypatch.setattr("sys.stderr", terminal)
-    with Progress(console=console) as progress:  # as SB3's, which is rich's by way of tqdm
+    with Progress(console=console) as progress:  # as SB3's progress bar does
         progress.add_task("training")
         evaluate(Watcher(), ENV_ID, ["slow"], n_episodes=2, progress_bar=True)
         assert "0/2 [" in terminal.getvalue()

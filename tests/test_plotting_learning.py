@@ -8,7 +8,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from sb3_have.evaluation.evaluation import iqm, stratified_bootstrap
+from sb3_have.evaluation.statistics import iqm, stratified_bootstrap
 from sb3_have.plotting import Curves, evaluation_curves, monitor_curves, plot_learning_curves
 
 STEPS = np.array([1000, 2000, 3000])

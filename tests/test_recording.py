@@ -1,4 +1,4 @@
-"""Recordings: what was seen, done, got and thought at each step belongs together, in any environment."""
+"""Recordings: observations, actions, rewards and values of a step belong together, in any environment."""
 
 import pickle
 from copy import deepcopy
@@ -77,6 +77,8 @@ def test_an_id_without_weather_is_rendered_where_it_can_be() -> None:
     assert len(recording.rewards) == len(recording.pictures) == 5
     assert recording.pictures[0].shape == (40, 80, 3) and recording.seconds == 0.2
     assert recording.rewards == pytest.approx(1 + recording.actions[:, 0])  # slow: 1 m and the throttle
+    # Each info is from before the action
+    assert [info["distance"] for info in recording.infos] == [0, 1, 2, 3, 4] and recording.end["distance"] == 5
     assert not recording.values and not recording.weights
     assert not record_episode(RandomDriver(), ENV_ID).pictures
     assert len(record_episode(RandomDriver(), ENV_ID, "fast", max_steps=2).rewards) == 2
@@ -140,7 +142,7 @@ def test_the_global_critic_alone_has_a_value_and_no_weights() -> None:
 def test_the_wrappers_of_the_training_are_put_on_in_their_order(normalize_first: bool) -> None:
     env = DummyVecEnv([lambda: RandomSensors(vectors_space())])
     model: PPO | SAC
-    if normalize_first:  # which off-policy algorithms refuse, having to store what is not normalised
+    if normalize_first:  # off-policy algorithms refuse this order, because they store unnormalised observations
         stacked = VecFrameStack(VecNormalize(env), 3, {"a": "first", "b": "last"})
         model = PPO("MultiInputPolicy", stacked, n_steps=10, batch_size=10, n_epochs=1, seed=0, device="cpu")
     else:

@@ -281,8 +281,8 @@ def test_statistics_of_a_subclass_and_at_another_place(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.obs_rms["a"].mean, env.obs_rms["a"].mean)
     assert wrap_as_trained(make(), model, found).observation_space == model.observation_space
     model, found = saved(VecFrameStack(VecNormalize(make()), 2))
-    with pytest.raises(ValueError, match=r"shapes {'a': \(2,\), .*{'a': \(4,\), .*within VecFrameStack"):
-        wrap_as_trained(make(), model, found)
+    with pytest.raises(ValueError, match="broadcast"):
+        record_episode(model, VECTORS, normalizer=found)
 
 
 def test_statistics_of_the_training_are_found(

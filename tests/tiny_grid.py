@@ -1,4 +1,4 @@
-"""A grid of small runs on the small stand-in of the driving environment, and a pool that makes them here."""
+"""A grid of small runs in the fake driving environment, and a pool that works in this process."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -33,9 +33,9 @@ def make_grid(folder: Path, config: dict[str, Any] | None = None, **changes: Any
 
 
 class LocalPool:
-    """Runs one thing after the other in this process.
+    """Runs one job after the other in this process.
 
-    :param work: in place of a run; what it raises is what the run died of
+    :param work: Called in place of a run; its exception is the run's
     """
 
     def __init__(self, work: Callable[[Job], bool], workers: int = 1) -> None:

@@ -1,5 +1,7 @@
-"""Methods side by side: a grid of training runs on one machine or a cluster, and tables and figures of its results.
+"""Compare methods: train a grid of methods x seeds, and report tables and figures of the results.
 
-python -m sb3_have.benchmark run benchmarks/grids/core.yml
-python -m sb3_have.benchmark report benchmarks/results/core
+What a single run needs does not belong here::
+
+    python -m sb3_have.benchmark run benchmarks/grids/core.yml
+    python -m sb3_have.benchmark report benchmarks/results/core
 """

@@ -1,6 +1,6 @@
-"""Figures of a benchmark. A method has the same colour, line and place in each; none is drawn by colour alone.
+"""The figures of a benchmark. A method looks the same in all of them, and can be recognised without colour.
 
-They draw on ``Figure`` objects: a user's pyplot stays untouched. No text is smaller than 9 points.
+They use matplotlib's ``Figure`` and leave pyplot alone. No text is smaller than 9 points.
 """
 
 from __future__ import annotations
@@ -11,10 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 
-from sb3_have.benchmark.breakdown import cases_of
 from sb3_have.benchmark.reading import DISTANCE, Measure, Results, ordered
-from sb3_have.benchmark.tables import score_table
-from sb3_have.evaluation.evaluation import performance_profile
+from sb3_have.benchmark.tables import cases_of, score_table
+from sb3_have.evaluation.statistics import performance_profile
 from sb3_have.plotting import weather as weather_figures
 from sb3_have.plotting.learning import whole_evaluations
 from sb3_have.plotting.style import (
@@ -28,13 +27,13 @@ from sb3_have.plotting.style import (
     modality_styles,
 )
 
+# Width of every figure [inch]
 WIDTH = 9.0
-"""Of every figure [inch]."""
+# Curves in a panel besides the reference: more would be hard to distinguish
 PER_PANEL = 7
-"""Curves of a panel, the reference not counted: more cannot be told apart."""
 
-# Okabe and Ito's colours, told apart by colour-blind people too; a method of the same family as another has its colour
-# with another line, marker and hatch.
+# Okabe and Ito's colours, which colour-blind readers can distinguish; methods of the same family share a colour and
+# differ in line, marker and hatch
 STYLES = {
     "rgb": Style("#D55E00", marker="s", hatch="\\\\\\"),
     "event": Style("#0072B2", marker="^", hatch="---"),
@@ -58,19 +57,19 @@ SPARE = tuple(Style(colour, "-.", "x", "xxx") for colour in ("#0072B2", "#D55E00
 
 
 def style(method: str) -> Style:
-    """The look of a method; one without its own takes a spare one that depends on its name alone."""
+    """Return the style of a method; an unknown one gets a spare style that depends only on its name."""
     return STYLES.get(method) or SPARE[sum(map(ord, method)) % len(SPARE)]
 
 
 def plot_progress(results: Results, reference: str = "have") -> Figure:
-    """Mean over weathers against training steps: a row of panels for every few methods, a column for each measure.
+    """Plot the mean over weathers against training steps, with a column for each measure.
 
-    A line is the mean over seeds; the reference's band reaches from the lowest to the highest of them, several bands
-    could not be told apart. Only the seeds that have come as far as their method's furthest count: a mean of other
-    seeds at other steps would jump where no run did.
+    A line is the mean over seeds. The reference alone has a band, from its lowest to its highest seed. Only the seeds
+    that are as far as their method's furthest one are used: a mean over different seeds at different steps would jump
+    where no run did.
 
-    :param results: with ``evaluations``
-    :param reference: method drawn in every panel, the only one with a band
+    :param results: The results
+    :param reference: Method to draw in every panel, with a band
     """
     curves = {method: learning_curves(results["evaluations"], method) for method in results.methods}
     methods = [method for method, of_method in curves.items() if len(of_method)]
@@ -90,10 +89,10 @@ def plot_progress(results: Results, reference: str = "have") -> Figure:
     for row in axes:
         for axis, measure in zip(row, measures, strict=True):
             _draw_drivers(axis, results["drivers"], measure)
-        # the panel that shows most: a driver may be in one measure's reach and not in the other's
+        # A driver may be within the range of one measure only: take the legend with the most entries
         handles, labels = max((axis.get_legend_handles_labels() for axis in row), key=lambda both: len(both[1]))
         row[-1].legend(handles, labels, fontsize=SMALL, loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
-    # when all are drawn, as it ends the growing of the axes that panels share
+    # After drawing, because setting a limit ends the autoscaling of the shared axes
     axes[0, 0].set_xlim(left=0)
     for axis, measure in zip(axes[0], measures, strict=True):
         if measure == DISTANCE:
@@ -102,11 +101,12 @@ def plot_progress(results: Results, reference: str = "have") -> Figure:
 
 
 def learning_curves(evaluations: pd.DataFrame, method: str) -> pd.DataFrame:
-    """The curve of each seed of a method that has come as far as its furthest.
+    """Return the learning curve of each seed that is as far as the method's furthest one.
 
-    :param evaluations: of all methods
-    :return: a row for each seed and step, ``seed``, ``step``, ``return_mean``, ``distance_mean``: means over weathers,
-        of the steps that all of these seeds have in every weather
+    :param evaluations: Evaluations of all methods
+    :param method: The method
+    :return: A row for each seed and step, ``seed``, ``step``, ``return_mean``, ``distance_mean``: means over weathers,
+        for the steps that all of these seeds have in every weather
     """
     own = whole_evaluations(evaluations[evaluations["method"] == method], evaluations["weather"].nunique())
     return pd.DataFrame(own.groupby(["seed", "step"], as_index=False)[["return_mean", "distance_mean"]].mean())
@@ -121,7 +121,7 @@ def _draw_curve(axis: Axes, method: str, curves: pd.DataFrame, measure: Measure,
 
 
 def _draw_drivers(axis: Axes, drivers: pd.DataFrame, measure: Measure) -> None:
-    """Levels of the drivers that did not learn; those far above the curves in words, as they would flatten them."""
+    """Draw the untrained drivers as levels; those far above the curves, which would flatten them, as text."""
     means = drivers.groupby("driver", sort=False)[f"{measure.name}_mean"].mean()
     bottom, top = axis.get_ylim()
     limit = bottom + 1.5 * (top - bottom)
@@ -132,20 +132,20 @@ def _draw_drivers(axis: Axes, drivers: pd.DataFrame, measure: Measure) -> None:
 
 
 def plot_scores(results: Results, reference: str = "have", table: pd.DataFrame | None = None) -> Figure:
-    """Interquartile mean of each method over seeds and weathers, with its 95% interval where there are seeds enough.
+    """Plot the interquartile mean of each method, with its 95% interval if there are enough seeds.
 
-    :param results: with finished runs
-    :param reference: as for :func:`~sb3_have.benchmark.tables.score_table`
-    :param table: its result, where it is known already
+    :param results: Results with finished runs
+    :param reference: As for :func:`~sb3_have.benchmark.tables.score_table`
+    :param table: The result of that function, if it is known already
     """
     table = score_table(results, reference) if table is None else table
     return _plot_intervals(results, table, "iqm", results.scored(), "IQM of {}")
 
 
 def plot_improvement(results: Results, reference: str = "have", table: pd.DataFrame | None = None) -> Figure:
-    """How often a run of the reference does better than one of each other method in the same weather.
+    """Plot how often the reference beats each other method in the same weather; parameters as for :func:`plot_scores`.
 
-    :raises ValueError: if the reference has no finished run, or nothing else has
+    :raises ValueError: If the reference or all other methods have no finished run
     """
     others = [method for method in results.scored() if method != reference]
     if not others or len(others) == len(results.scored()):
@@ -159,7 +159,7 @@ def plot_improvement(results: Results, reference: str = "have", table: pd.DataFr
 
 
 def _plot_intervals(results: Results, table: pd.DataFrame, name: str, methods: list[str], label: str) -> Figure:
-    """A dot for each method, hollow where it has no interval; the first method on top."""
+    """Draw a dot for each method, hollow if it has no interval, with the first method on top."""
     measures = list(reversed(results.measures))
     figure = Figure(figsize=(WIDTH, 1.1 + 0.3 * len(methods)), layout="constrained")
     axes = figure.subplots(1, len(measures), sharey=True, squeeze=False)[0]
@@ -183,14 +183,15 @@ def _plot_intervals(results: Results, table: pd.DataFrame, name: str, methods: l
 
 
 def plot_profiles(results: Results, measure: Measure = DISTANCE, reference: str = "have") -> Figure:
-    """Share of runs, over all weathers, whose mean exceeds a threshold: the higher the line, the better.
+    """Plot the share of runs, over all weathers, whose mean exceeds a threshold: the higher the line, the better.
 
-    :param measure: of the thresholds
-    :param reference: method drawn in every panel
+    :param results: Results with finished runs
+    :param measure: Measure of the thresholds
+    :param reference: Method to draw in every panel
     """
     methods = results.scored()
     scores = {method: results.scores(method, measure) for method in methods}
-    # the profiles are constant in between
+    # The profiles are constant in between
     thresholds = np.unique(np.concatenate([[0.0], *(table.ravel() for table in scores.values())]))
     others = [method for method in methods if method != reference]
     groups = [others[i : i + PER_PANEL] for i in range(0, len(others), PER_PANEL)] or [[]]
@@ -210,7 +211,7 @@ def plot_profiles(results: Results, measure: Measure = DISTANCE, reference: str 
                 linewidth=width,
                 marker=look.marker,
                 markersize=6,
-                markevery=(0.02 * number, 0.16),  # parts of the axes, so that markers of several lines are apart
+                markevery=(0.02 * number, 0.16),  # in parts of the axes, so that the lines' markers do not overlap
                 label=method,
             )
         axis.set(xlabel=f"threshold of {measure.label}", ylim=(-0.03, 1.03))
@@ -224,22 +225,19 @@ def plot_profiles(results: Results, measure: Measure = DISTANCE, reference: str 
 
 
 def plot_weather_weights(results: Results) -> Figure:
-    """Mean weight of each modality by weather: a row for each method; whiskers from the lowest to the highest seed.
-
-    :param results: with ``weights``
-    """
+    """Plot the mean weight of each modality by weather; see :func:`sb3_have.plotting.plot_weather_weights`."""
     weights = results["weights"]
     weathers = [weather for weather in results.weathers if weather in set(weights["weather"])]
     return weather_figures.plot_weather_weights(weights, weathers or None, ordered(set(weights["method"])))
 
 
 def plot_episode_weights(results: Results, method: str, seed: int) -> Figure:
-    """Weight of each modality over one episode of each weather (the paper's Fig. 5).
+    """Plot the weight of each modality over one episode of each weather (the paper's Fig. 5).
 
-    :param results: with ``weights``
-    :param method: that has weights
-    :param seed: of the run
-    :raises ValueError: if the run has no weights
+    :param results: The results
+    :param method: Method with weights
+    :param seed: Seed of the run
+    :raises ValueError: If the run has no weights
     """
     weights = results["weights"]
     weights = weights[(weights["method"] == method) & (weights["seed"] == seed)]
@@ -261,8 +259,8 @@ def plot_episode_weights(results: Results, method: str, seed: int) -> Figure:
             line = episode[episode["modality"] == modality].sort_values("t")
             axis.plot(line["t"], line["weight"], color=look.colour, linestyle=look.line, linewidth=1.2, label=modality)
         ended = driven[(driven["weather"] == weather) & (driven["episode_seed"] == episode["episode_seed"].iloc[0])]
-        told = f", return {ended['return'].iloc[0]:.0f}" if len(ended) else ""
-        axis.set_title(f"{weather}{told}", fontsize=SMALL)
+        outcome = f", return {ended['return'].iloc[0]:.0f}" if len(ended) else ""
+        axis.set_title(f"{weather}{outcome}", fontsize=SMALL)
         axis.set_ylim(0, 1)
         axis.grid(alpha=0.3)
     for axis in axes.flat[len(weathers) :]:
@@ -274,11 +272,13 @@ def plot_episode_weights(results: Results, method: str, seed: int) -> Figure:
 
 
 def plot_failures(table: pd.DataFrame, measure: Measure) -> Figure:
-    """What every method reaches under each failure: a row for each modality, in it a group of bars for each kind of
-    failure beside one with sound sensors; whiskers from the lowest to the highest seed.
+    """Plot every method under each sensor failure.
 
-    :param table: from :func:`~sb3_have.benchmark.breakdown.failure_table`
-    :param measure: the height of the bars
+    Each modality has a row, with a group of bars without a failure and one for each kind of failure. Whiskers reach
+    from the lowest to the highest seed.
+
+    :param table: From :func:`~sb3_have.benchmark.tables.failure_table`
+    :param measure: Measure of the bars
     """
     modalities = list(modality_styles(set(table.loc[table["kind"] != "none", "modality"])))
     methods = ordered(set(table["method"]))
@@ -293,7 +293,8 @@ def plot_failures(table: pd.DataFrame, measure: Measure) -> Figure:
                 for row in table[table["method"] == method].to_dict("records")
             }
             known = [case for case in cases if case in rows]
-            if len(known) < 2:  # a method without this modality
+            # Leave out a method without this modality
+            if len(known) < 2:
                 continue
             places = [[*cases].index(case) + (number - (len(methods) - 1) / 2) * width for case in known]
             heights, lowest, highest = (

@@ -1,34 +1,34 @@
-"""What a benchmark runs: methods and seeds, how long they train, and what they are asked afterwards.
+"""The grid of a benchmark: which methods and seeds to train, for how long, and how to evaluate them.
 
-A grid is a YAML file; only ``methods`` and ``seeds`` have to be there::
+A grid is a YAML file; only ``methods`` and ``seeds`` are required::
 
     env: HighwayVision-v0
     steps: 30000
-    methods: [sac, lve, have]      # of zoo_configs, or files relative to the grid's; the name of a file is the method's
-    seeds: [0, 1, 2]               # order of work: seed by seed over all methods
+    methods: [sac, lve, have]      # from zoo_configs, or files relative to the grid's; a method is named after its file
+    seeds: [0, 1, 2]               # runs are ordered by seed, then by method
     weathers: [ClearNoon, ...]     # default: all eight
     hyperparams: {env_kwargs: {vehicles_count: 20}, batch_size: 64}
-    modalities: [rgb, event]       # default: every method's own
+    modalities: [rgb, event]       # default: each method's own
     eval_freq: 5000                # steps between the points of the learning curve, 0 for none
-    eval_episodes: 1               # of a point, in each weather
-    final_episodes: 10             # after training, in each weather
-    final_seed: 2000000            # of the first of those; a search takes others than the tables
-    eval_envs: 16                  # environments of an evaluation at a time, in the run's process
+    eval_episodes: 1               # episodes of a point, in each weather
+    final_episodes: 10             # episodes after training, in each weather
+    final_seed: 2000000            # seed of those episodes; a search uses other episodes than the tables
+    eval_envs: 16                  # number of environments of an evaluation, in the process of the run
     save_freq: 5000                # steps between checkpoints
-    failures: {kinds: [black, frozen, noise], severity: 3, episodes: 1}   # after that; left out: none
+    failures: {kinds: [black, frozen, noise], severity: 3, episodes: 1}   # default: no sensor failures
 
-``hyperparams`` stand in the place of every method's own. Of ``env_kwargs`` and ``policy_kwargs`` only given keys do:
-``{env_kwargs: {image_size: 84}}`` leaves the rest as it was. In ``policy_kwargs`` a method's own keys stay, as they are
-what makes it that method. For the same reason ``modalities`` is a key of its own and not of ``env_kwargs``: it gives
-other sensors to every method that has several, and leaves ``rgb`` its one.
+``hyperparams`` override those of every method. ``env_kwargs`` and ``policy_kwargs`` are merged key by key:
+``{env_kwargs: {image_size: 84}}`` changes nothing else. They cannot change ``policy_kwargs`` that a method has itself,
+because those make it that method. For the same reason ``modalities`` is a key of its own and not part of
+``env_kwargs``: it changes the sensors of every method that has several, and leaves ``rgb`` its one.
 """
 
 from __future__ import annotations
 
 import inspect
 import json
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
@@ -36,113 +36,171 @@ from typing import Any
 
 import gymnasium as gym
 import yaml
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, field_validator, model_validator
 
-from sb3_have.configuration import config_path, load_config
+from sb3_have.benchmark.reading import method_name
+from sb3_have.configuration import config_names, load_config
 from sb3_have.envs.weather import WEATHERS
 from sb3_have.sensors import SENSORS, failures_for
 from sb3_have.train import algorithm_of, algorithms
 
+# Seed of the episodes after training, the same for all methods and seeds. No run is trained on these episodes or
+# selected by them (:data:`sb3_have.evaluation.callback.EVALUATION_SEED`).
 FINAL_SEED = 2_000_000
-"""Seed of the first episode after training, the same for all methods and seeds. No run is trained on these episodes
-or chosen by them (:data:`sb3_have.evaluation.callback.EVALUATION_SEED`)."""
 
 NOT_OF_THE_MODEL = {"n_envs", "frame_stack", "env_kwargs", "env_wrapper"}
 OWN_ENVS = ("HighwayVision-v0", "CarlaVision-v0")
 
 
 class GridError(ValueError):
-    """A grid that cannot be run; the message names the key, its value and the remedy."""
+    """A grid that cannot be run. The message names the key, its value and the remedy."""
 
 
-@dataclass(frozen=True)
-class Failures:
-    """Sensors that fail for whole episodes after training.
+class Failures(BaseModel):
+    """Sensor failures for whole episodes after training.
 
-    :param kinds: of failure, see :data:`sb3_have.sensors.failures.FAILURES`; each on every modality that knows it
+    :param kinds: Kinds of failure, see :data:`sb3_have.sensors.failures.FAILURES`; each on every modality that has it
     :param severity: 1, 2 or 3
-    :param episodes: in each weather, the first of the final evaluation
+    :param episodes: Number of episodes in each weather, the first ones of the final evaluation
     """
 
-    kinds: tuple[str, ...]
-    severity: int = 3
-    episodes: int = 1
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    kinds: tuple[str, ...] = Field(min_length=1)
+    severity: int = Field(3, ge=1, le=3)
+    episodes: int = Field(1, ge=1)
+
+    @field_validator("kinds")
+    @classmethod
+    def _known_kinds(cls, kinds: tuple[str, ...]) -> tuple[str, ...]:
+        return _known(kinds, {kind for sensor in SENSORS for kind in failures_for(sensor)})
 
 
-@dataclass(frozen=True)
-class Grid:
-    """Methods x seeds and what is done with each; the parameters are the keys of the file, see this module."""
+class Grid(BaseModel):
+    """Methods x seeds and how they are evaluated. The fields are the keys of the file, see this module."""
 
-    name: str
-    methods: tuple[str, ...]
-    seeds: tuple[int, ...]
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    methods: tuple[str, ...] = Field(min_length=1)
+    seeds: tuple[int, ...] = Field(min_length=1)
     env: str = "HighwayVision-v0"
-    steps: int = 30_000
-    weathers: tuple[str, ...] = WEATHERS
+    steps: int = Field(30_000, ge=1)
+    weathers: tuple[str, ...] = Field(WEATHERS, min_length=1)
     modalities: tuple[str, ...] = ()
-    hyperparams: Mapping[str, Any] = field(default_factory=dict)
-    eval_freq: int = 5_000
-    eval_episodes: int = 1
-    final_episodes: int = 10
-    final_seed: int = FINAL_SEED
-    eval_envs: int = 16
-    save_freq: int = 5_000
+    hyperparams: dict[str, Any] = {}
+    eval_freq: int = Field(5_000, ge=0)
+    eval_episodes: int = Field(1, ge=1)
+    final_episodes: int = Field(10, ge=1)
+    final_seed: int = Field(FINAL_SEED, ge=0)
+    eval_envs: int = Field(16, ge=1)
+    save_freq: int = Field(5_000, ge=0)
     failures: Failures | None = None
 
-    def jobs(self, only: Iterable[str] = ()) -> list[Job]:
-        """The runs in the order of work.
+    _path: Path = PrivateAttr(Path("grid.yml"))
 
-        :param only: methods to keep, all if there are none
-        :raises GridError: if one of ``only`` is not in the grid, or a method's configuration does not fit
+    @property
+    def name(self) -> str:
+        """The name of the file, without the ending."""
+        return self._path.stem
+
+    @field_validator("methods", "seeds", "weathers", "modalities")
+    @classmethod
+    def _unique(cls, items: tuple[Any, ...]) -> tuple[Any, ...]:
+        names = [method_name(str(item)) for item in items]
+        if repeated := [name for name in names if names.count(name) > 1]:
+            raise ValueError(f"{repeated[0]!r} is listed twice")
+        return items
+
+    @field_validator("seeds")
+    @classmethod
+    def _not_negative(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
+        if min(seeds) < 0:
+            raise ValueError("a seed must be 0 or more")
+        return seeds
+
+    @field_validator("env")
+    @classmethod
+    def _registered(cls, env: str) -> str:
+        module, _, env_id = env.rpartition(":")
+        try:
+            if module:
+                import_module(module)
+            gym.spec(env_id)
+        except (gym.error.Error, ImportError) as error:
+            raise ValueError(f"it is not registered ({error})") from None
+        return env
+
+    @field_validator("hyperparams")
+    @classmethod
+    def _mappings(cls, hyperparams: dict[str, Any]) -> dict[str, Any]:
+        for key in ("env_kwargs", "policy_kwargs"):
+            if not isinstance(hyperparams.get(key, {}), dict):
+                raise ValueError(f"{key} must be a mapping")
+        if "n_timesteps" in hyperparams:
+            raise ValueError("n_timesteps has no effect here; use the grid's key 'steps'")
+        if "modalities" in hyperparams.get("env_kwargs", {}):
+            raise ValueError("env_kwargs.modalities would give rgb several sensors; use the grid's key 'modalities'")
+        _refuse_numbers_as_text(hyperparams)
+        return hyperparams
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Grid:
+        if self.env in OWN_ENVS:
+            _known(self.weathers, WEATHERS, "weathers: ")
+            _known(self.modalities, SENSORS, "modalities: ")
+        if self.env == "CarlaVision-v0" and self.eval_envs > 1:
+            raise ValueError(f"eval_envs: {self.eval_envs} environments cannot share a CARLA server; use eval_envs: 1")
+        if self.failures is not None and self.failures.episodes > self.final_episodes:
+            raise ValueError(
+                f"failures.episodes: {self.failures.episodes} is more than final_episodes, {self.final_episodes}, "
+                "the episodes without a failure to compare with"
+            )
+        return self
+
+    def jobs(self, only: Iterable[str] = ()) -> list[Job]:
+        """Return the runs in the order of work.
+
+        :param only: Methods to keep; all if empty
+        :raises GridError: If the grid lacks one of ``only``, or a method's configuration does not fit
         """
-        names = [method_name(method) for method in self.methods]
-        if unknown := [name for name in only if name not in names]:
-            raise GridError(f"--only: {self.name} has no {unknown[0]!r}{_remedy(unknown[0], names)}")
-        configs = {name: self._config(method) for name, method in zip(names, self.methods, strict=True)}
-        kept = [name for name in names if not only or name in only]
+        configs = {method_name(method): self._config(method) for method in self.methods}
+        try:
+            _known(only, configs, "--only: ")
+        except ValueError as error:
+            raise GridError(str(error)) from None
+        kept = [name for name in configs if not only or name in only]
         return [Job(self, name, seed, algorithm_of(name), configs[name]) for seed in self.seeds for name in kept]
 
     def _config(self, method: str) -> dict[str, Any]:
+        """Return the hyper-parameters of a method, merged with the grid's."""
+        beside = self._path.parent / method
         try:
-            own = load_config(method, self.env)
+            own = load_config(str(beside if beside.is_file() else method), self.env)
+        except FileNotFoundError as error:
+            raise GridError(f"methods: {error}{_suggestion(method, config_names())}") from None
         except KeyError as error:
             raise GridError(f"methods: {error.args[0]}") from None
         config = merge(own, self.hyperparams)
         if self.modalities and len(config.get("env_kwargs", {}).get("modalities", self.modalities)) > 1:
             config["env_kwargs"] = {**config.get("env_kwargs", {}), "modalities": [*self.modalities]}
-        name, algo = method_name(method), algorithm_of(method_name(method))
-        known = {*inspect.signature(algorithms()[algo]).parameters, *NOT_OF_THE_MODEL}
-        if unknown := [key for key in config if key not in known]:
-            raise GridError(f"hyperparams: {algo} (for {name}) knows no {unknown[0]!r}{_remedy(unknown[0], known)}")
+        algo = algorithm_of(method_name(method))
+        parameters = {*inspect.signature(algorithms()[algo]).parameters, *NOT_OF_THE_MODEL}
+        try:
+            _known(config, parameters, f"hyperparams of {method_name(method)} ({algo}): ")
+        except ValueError as error:
+            raise GridError(str(error)) from None
         return config
-
-    def overruled(self) -> list[str]:
-        """Which of the grid's ``policy_kwargs`` do not reach methods because those have their own.
-
-        :raises GridError: if one reaches none of them
-        """
-        told = []
-        own = {method_name(m): load_config(m, self.env).get("policy_kwargs", {}) for m in self.methods}
-        for key, value in self.hyperparams.get("policy_kwargs", {}).items():
-            others = {name: mine[key] for name, mine in own.items() if mine.get(key, value) != value}
-            if len(others) == len(own):
-                raise GridError(
-                    f"hyperparams: policy_kwargs.{key}: {value!r} reaches no method, all have their own; remove it"
-                )
-            told += [
-                f"{name} keeps its own policy_kwargs.{key}: {other!r}, not {value!r}" for name, other in others.items()
-            ]
-        return told
 
 
 @dataclass(frozen=True)
 class Job:
     """One run of a grid.
 
-    :param grid: to which it belongs
-    :param method: its name
-    :param seed: of the training
-    :param algo: name in :func:`sb3_have.train.algorithms`
-    :param config: the method's hyper-parameters, merged with the grid's
+    :param grid: The grid
+    :param method: Name of the method
+    :param seed: Seed of the training
+    :param algo: Name of the algorithm in :func:`sb3_have.train.algorithms`
+    :param config: The method's hyper-parameters, merged with the grid's
     """
 
     grid: Grid
@@ -153,12 +211,12 @@ class Job:
 
     @property
     def name(self) -> str:
-        """Of the run's folder."""
+        """Name of the run and its folder."""
         return f"{self.method}-{self.seed}"
 
     @property
     def settings(self) -> dict[str, Any]:
-        """All that decides on a run's results but its seed, its steps and the failures of its sensors."""
+        """Everything that determines a run's results except its seed, its steps and the sensor failures."""
         settings = {**self.config, "algo": self.algo, "env_id": self.grid.env}
         if self.grid.final_seed != FINAL_SEED:
             settings["final_seed"] = self.grid.final_seed
@@ -166,26 +224,25 @@ class Job:
 
 
 def merge(own: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> dict[str, Any]:
-    """A method's configuration under a grid's ``hyperparams``, without ``n_timesteps``: the grid has ``steps``."""
+    """Merge a method's configuration with a grid's ``hyperparams``. ``n_timesteps`` is dropped: the grid has ``steps``.
+
+    :raises GridError: If they change the method's own ``policy_kwargs``
+    """
     merged = {**own, **hyperparams}
-    if "env_kwargs" in merged:
-        merged["env_kwargs"] = {**own.get("env_kwargs", {}), **hyperparams.get("env_kwargs", {})}
-    if "policy_kwargs" in merged:
-        merged["policy_kwargs"] = {**hyperparams.get("policy_kwargs", {}), **own.get("policy_kwargs", {})}
+    for key in {"env_kwargs", "policy_kwargs"} & merged.keys():
+        merged[key] = {**own.get(key, {}), **hyperparams.get(key, {})}
+    for key, value in own.get("policy_kwargs", {}).items():
+        if merged["policy_kwargs"][key] != value:
+            raise GridError(f"hyperparams: policy_kwargs.{key} is part of a method, which has {value!r}; remove it")
     merged.pop("n_timesteps", None)
     return merged
-
-
-def method_name(method: str) -> str:
-    """Of an entry of ``methods``: itself, or the name of the file."""
-    return Path(method).stem if method.endswith((".yml", ".yaml")) else method
 
 
 def read_grid(path: Path) -> Grid:
     """Read and check a grid.
 
-    :param path: YAML file; its name without the ending is the grid's
-    :raises GridError: if a key is unknown or missing, or a value is not what it has to be
+    :param path: YAML file, whose name without the ending is the grid's
+    :raises GridError: If a key is unknown or missing, or a value is wrong
     """
     try:
         given = yaml.safe_load(path.read_text())
@@ -194,177 +251,52 @@ def read_grid(path: Path) -> Grid:
     if not isinstance(given, dict):
         raise GridError(f"{path}: expected keys and values such as 'steps: 30000', got {given!r}")
     try:
-        values = _checked(given, GRID_KEYS, ("methods", "seeds"))
-        values["methods"] = tuple(_found(method, path.parent) for method in values["methods"])
-        grid = Grid(name=path.stem, **values)
-        _check_whole(grid)
+        grid = Grid.model_validate(given)
+        grid._path = path
+        # Check the configurations of all methods
         grid.jobs()
-        grid.overruled()
+    except ValidationError as errors:
+        raise GridError("\n".join(f"{path}: {_in_words(error)}" for error in errors.errors())) from None
     except GridError as error:
         raise GridError(f"{path}: {error}") from None
     return grid
 
 
-def _check_whole(grid: Grid) -> None:
-    """What no key tells by itself."""
-    module, _, env_id = grid.env.rpartition(":")
-    try:
-        if module:
-            import_module(module)
-        gym.spec(env_id)
-    except (gym.error.Error, ImportError) as error:
-        raise GridError(f"env: {grid.env!r} is not registered: {error}") from None
-    names = [method_name(method) for method in grid.methods]
-    lists = {"methods": names, "seeds": grid.seeds, "weathers": grid.weathers, "modalities": grid.modalities}
-    for key, items in lists.items():
-        if twice := [item for item in items if list(items).count(item) > 1]:
-            raise GridError(f"{key}: {twice[0]!r} is there twice; every one may stand there once")
-    if grid.env in OWN_ENVS and (unknown := [weather for weather in grid.weathers if weather not in WEATHERS]):
-        raise GridError(f"weathers: there is no {unknown[0]!r}{_remedy(unknown[0], WEATHERS)}")
-    if grid.env in OWN_ENVS and (unknown := [name for name in grid.modalities if name not in SENSORS]):
-        raise GridError(f"modalities: there is no {unknown[0]!r}{_remedy(unknown[0], SENSORS)}")
-    if grid.env == "CarlaVision-v0" and grid.eval_envs > 1:
-        raise GridError(f"eval_envs: {grid.eval_envs} environments cannot share a CARLA server; write eval_envs: 1")
-    if "n_timesteps" in grid.hyperparams:
-        raise GridError("hyperparams: n_timesteps does nothing here; the steps of all runs are 'steps'")
-    for part in ("env_kwargs", "policy_kwargs"):
-        if not isinstance(grid.hyperparams.get(part, {}), dict):
-            raise GridError(f"hyperparams: {part}: expected keys and values, got {grid.hyperparams[part]!r}")
-    if "modalities" in grid.hyperparams.get("env_kwargs", {}):
-        raise GridError(
-            "hyperparams: env_kwargs: modalities would give rgb several sensors; put them under the grid's own key "
-            f"modalities: {grid.hyperparams['env_kwargs']['modalities']!r}, which reaches the methods that have several"
-        )
-    if grid.failures is not None and grid.failures.episodes > grid.final_episodes:
-        raise GridError(
-            f"failures: episodes: {grid.failures.episodes} is more than final_episodes, {grid.final_episodes}: "
-            "they are compared with the healthy car in the first of those; use at most as many"
-        )
+def _in_words(error: Any) -> str:
+    """Describe a validation error of pydantic by its key, its value and the remedy."""
+    key, kind = ".".join(map(str, error["loc"])), error["type"]
+    if kind == "extra_forbidden":
+        fields = Failures.model_fields if len(error["loc"]) > 1 else Grid.model_fields
+        return f"unknown key {key!r}{_suggestion(str(error['loc'][-1]), fields)}"
+    if kind == "missing":
+        return f"the key {key!r} is missing"
+    message = error["msg"].removeprefix("Value error, ")
+    return f"{key}: {message}, got {error['input']!r}" if key else message
 
 
-def _found(method: str, folder: Path) -> str:
-    """The configuration of a method: a file beside the grid, or the name of one in ``zoo_configs``."""
-    if method_name(method) != method:
-        for path in (folder / method, Path(method)):
-            if path.is_file():
-                return str(path)
-        raise GridError(f"methods: there is no file {method!r}, neither from {folder.resolve()} nor from here")
-    try:
-        path = config_path(method)
-    except FileNotFoundError:
-        known = [path.stem for path in config_path("havesac").parent.glob("*.yml")]
-        raise GridError(f"methods: there is no zoo_configs/{method}.yml{_remedy(method, known)}") from None
-    if path == Path(method):
-        raise GridError(f"methods: {method!r} is a file here; name it with its ending, .yml")
-    return method
+def _known(names: Iterable[str], known: Iterable[str], prefix: str = "") -> tuple[str, ...]:
+    """Return the names, or raise an error if one is unknown."""
+    names, known = tuple(names), set(known)
+    if unknown := [name for name in names if name not in known]:
+        raise ValueError(f"{prefix}unknown name {unknown[0]!r}{_suggestion(unknown[0], known)}")
+    return names
 
 
-def _remedy(word: str, known: Iterable[str]) -> str:
-    """The right word for a wrong one, if one is near; else all."""
+def _suggestion(word: str, known: Iterable[str]) -> str:
+    """Suggest the word that was probably meant, or all of them if none is similar."""
     known = sorted(known)
-    near = get_close_matches(word, known, n=1)
-    return f"; did you mean {near[0]!r}?" if near else f"; known are {', '.join(known)}"
+    similar = get_close_matches(word, known, n=1)
+    return f"; did you mean {similar[0]!r}?" if similar else f"; choose from {', '.join(known)}"
 
 
-def _checked(given: Mapping[str, Any], readers: Mapping[str, Reader], needed: Iterable[str]) -> dict[str, Any]:
-    if unknown := [key for key in given if key not in readers]:
-        raise GridError(f"unknown key {unknown[0]!r}{_remedy(str(unknown[0]), readers)}")
-    if missing := [key for key in needed if key not in given]:
-        raise GridError(f"{missing[0]!r} is missing; add it")
-    values = {}
-    for key, value in given.items():
-        try:
-            values[key] = readers[key](value)
-        except GridError as error:
-            raise GridError(f"{key}: {error}") from None
-        except ValueError as error:
-            raise GridError(f"{key}: expected {error}, got {value!r}") from None
-    return values
-
-
-def _whole(least: int, most: float = float("inf")) -> Reader:
-    def read(value: Any) -> int:
-        whole = isinstance(value, int | float) and not isinstance(value, bool) and value % 1 == 0
-        if not whole or not least <= value <= most:
-            raise ValueError(f"a whole number >= {least}" if most == float("inf") else f"one of {least} to {most}")
-        return int(value)
-
-    return read
-
-
-def _list_of(what: str, read: Reader) -> Reader:
-    def read_list(value: Any) -> tuple[Any, ...]:
-        if not isinstance(value, list) or not value:
-            raise ValueError(f"a list of {what}")
-        try:
-            return tuple(map(read, value))
-        except GridError:
-            raise
-        except ValueError:
-            raise ValueError(f"a list of {what}") from None
-
-    return read_list
-
-
-def _text(value: Any) -> str:
-    if not isinstance(value, str) or not value:
-        raise ValueError("a name")
-    return value
-
-
-def _mapping(value: Any) -> dict[str, Any]:
-    if not isinstance(value, dict):
-        raise ValueError("keys and values such as {batch_size: 64}")
-    return value
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
-def _hyperparams(value: Any) -> dict[str, Any]:
-    for key, item in _mapping(value).items():
-        if isinstance(item, dict):
-            _hyperparams(item)
-        if isinstance(item, str) and _is_number(item):
-            raise GridError(f"{key}: {item} is a word in YAML; write !!float {item}")
-    return dict(value)
-
-
-def _kind(value: Any) -> str:
-    known = {kind for sensor in SENSORS for kind in failures_for(sensor)}
-    if value not in known:
-        raise GridError(f"there is no {value!r}{_remedy(str(value), known)}")
-    return str(value)
-
-
-def _failures(value: Any) -> Failures:
-    return Failures(**_checked(_mapping(value), FAILURE_KEYS, ("kinds",)))
-
-
-Reader = Callable[[Any], Any]
-FAILURE_KEYS: dict[str, Reader] = {
-    "kinds": _list_of("kinds of failure", _kind),
-    "severity": _whole(1, 3),
-    "episodes": _whole(1),
-}
-GRID_KEYS: dict[str, Reader] = {
-    "env": _text,
-    "steps": _whole(1),
-    "methods": _list_of("names", _text),
-    "seeds": _list_of("whole numbers >= 0", _whole(0)),
-    "weathers": _list_of("names", _text),
-    "modalities": _list_of("names", _text),
-    "hyperparams": _hyperparams,
-    "eval_freq": _whole(0),
-    "eval_episodes": _whole(1),
-    "eval_envs": _whole(1),
-    "final_episodes": _whole(1),
-    "final_seed": _whole(0),
-    "save_freq": _whole(0),
-    "failures": _failures,
-}
+def _refuse_numbers_as_text(values: Mapping[str, Any]) -> None:
+    """Refuse numbers such as 1e-3, which YAML reads as text: a run would fail in its first update."""
+    for key, value in values.items():
+        if isinstance(value, dict):
+            _refuse_numbers_as_text(value)
+        elif isinstance(value, str):
+            try:
+                float(value)
+            except ValueError:
+                continue
+            raise ValueError(f"YAML reads {key}: {value} as text; write {key}: !!float {value}")

@@ -1,10 +1,10 @@
-"""Run a grid: methods x seeds side by side, to be stopped and started again at any moment.
+"""Run a grid of methods x seeds, which can be stopped and resumed at any moment.
 
     python -m sb3_have.benchmark run benchmarks/grids/core.yml
 
-Ctrl-C, SIGTERM and ``--time-limit`` let every run save a checkpoint; the same command goes on, also after a crash of
-the machine. Finished runs are not repeated. Runs are in RUNS/<method>-<seed>/, results in RESULTS/*.csv, which grow by
-a run at a time.
+On Ctrl-C, SIGTERM or after ``--time-limit`` every run saves a checkpoint; the same command resumes, also after a crash
+of the machine. Finished runs are not repeated. The runs are in RUNS/<method>-<seed>/, the results in RESULTS/*.csv,
+which grow by one run at a time.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import Any, Protocol
 
 from tqdm import tqdm
 
-from sb3_have.benchmark.grid import Grid, GridError, Job, read_grid
+from sb3_have.benchmark.grid import GridError, Job, read_grid
 from sb3_have.benchmark.pool import RayPool
 from sb3_have.benchmark.results import is_finished, merge
 from sb3_have.benchmark.stages import collect, steps_done
@@ -30,14 +30,14 @@ from sb3_have.checkpoint.files import locked
 
 RETRIES = 2
 REFRESH_SECONDS = 2.0
+# How long the runs may take to save their checkpoints, with replay buffers, after a stop
 GRACE_SECONDS = 300.0
-"""For all runs to save their checkpoints, replay buffers and all, when they are asked to stop."""
 
 FINISHED, FAILED, STOPPED = 0, 1, 3
 
 
 class Pool(Protocol):
-    """What :class:`~sb3_have.benchmark.pool.RayPool` does."""
+    """The interface of :class:`~sb3_have.benchmark.pool.RayPool`."""
 
     workers: int
 
@@ -49,14 +49,14 @@ class Pool(Protocol):
 
 
 class Runner:
-    """The runs of a grid, their results and how far they are.
+    """Works through the runs of a grid and collects their results.
 
-    :param jobs: to run, in order
-    :param runs: folder of the runs' folders
-    :param results: folder of the results
-    :param retries: how often a run that dies is started again
-    :param time_limit: of this call [s]; None for none
-    :raises GridError: if the results hold one of the runs with other settings
+    :param jobs: Runs in the order of work
+    :param runs: Folder of the runs' folders
+    :param results: Folder of the results
+    :param retries: How often to restart a run that fails
+    :param time_limit: Time after which to stop [s]; None for none
+    :raises GridError: If the results contain one of the runs with other settings
     """
 
     def __init__(
@@ -72,16 +72,16 @@ class Runner:
 
     @property
     def is_done(self) -> bool:
-        """Whether nothing is left to do."""
+        """Whether there is nothing left to do."""
         return not self._todo
 
     def run(self, pool: Pool) -> int:
-        """Work until all is done or a stop is asked for.
+        """Work until everything is done, or until a stop.
 
-        :return: exit code, 0 if every run is finished, 1 if one failed for good, 3 if stopped before the end
+        :return: Exit code: 0 if every run is finished, 1 if one failed, 3 if stopped before the end
         """
         total = sum(job.grid.steps for job in self.jobs)
-        # a log file gets a line now and then, a terminal a bar that moves
+        # Refresh the bar often in a terminal, and rarely in a log file
         interval = 0.1 if sys.stderr.isatty() else 60.0
         with tqdm(total=total, initial=self._steps(), unit="step", smoothing=0, mininterval=interval) as bar:
             with self._signals():
@@ -92,15 +92,17 @@ class Runner:
     def _work(self, pool: Pool, bar: tqdm[Any]) -> None:
         stopped_at = None
         while pool.running or (self._todo and not self.stopping):
+            # Stop all runs if requested
             if self._deadline is not None and time.monotonic() > self._deadline:
                 self.stopping = True
             if self.stopping and stopped_at is None:
                 stopped_at = time.monotonic()
-                bar.write(f"stopping: {len(pool.running)} runs save what they have")
+                bar.write(f"stopping: {len(pool.running)} runs are saving checkpoints")
                 pool.stop()
             elif stopped_at is not None and time.monotonic() - stopped_at > GRACE_SECONDS:
                 bar.write(f"gave up waiting for {', '.join(job.name for job in pool.running)}")
                 return
+            # Start runs on free workers and collect those that ended
             while self._todo and len(pool.running) < pool.workers and not self.stopping:
                 pool.start(self._todo.popleft())
             for job, outcome in pool.wait(REFRESH_SECONDS):
@@ -110,30 +112,28 @@ class Runner:
             bar.update(0)
 
     def _settle(self, job: Job, outcome: bool | Exception) -> str:
-        """Take in how a run ended; a line about it."""
+        """Handle the end of a run, and describe it in a line."""
+        folder = self.runs / job.name
         if outcome is True:
-            tables = collect(job, self.runs / job.name)
+            tables = collect(job, folder)
             merge(self.results, job, tables)
             self.finished.add(job.name)
-            (self.runs / job.name / "traceback.txt").unlink(missing_ok=True)
+            (folder / "traceback.txt").unlink(missing_ok=True)
             last, minutes = tables["final"], float(tables["runs"]["minutes"].iloc[0])
             return (
                 f"{job.name}: return {last['return_mean'].mean():.1f}, distance {last['distance_mean'].mean():.0f} m "
                 f"over {len(last)} weathers, {minutes:.1f} min; {len(self.finished)} of {len(self.jobs)} runs finished"
             )
-        if outcome is False:
-            if not self.stopping:  # it was stopped by somebody else
-                return self._again(job, "it was stopped from outside")
-            return f"{job.name}: stopped at step {steps_done(self.runs / job.name)}"
-        return self._again(job, str(outcome).strip() or type(outcome).__name__)
+        if outcome is False and self.stopping:
+            return f"{job.name}: stopped after step {steps_done(folder)}"
 
-    def _again(self, job: Job, reason: str) -> str:
-        path = self.runs / job.name / "traceback.txt"
+        # The run failed: start it again, or give up
+        reason = "it was stopped from outside" if outcome is False else str(outcome).strip() or type(outcome).__name__
+        path = folder / "traceback.txt"
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(f"{reason}\n")
         self._attempts[job.name] += 1
-        attempt, attempts = self._attempts[job.name], self.retries + 1
-        last_line = reason.splitlines()[-1]
+        attempt, attempts, last_line = self._attempts[job.name], self.retries + 1, reason.splitlines()[-1]
         if attempt == attempts:
             self.failed.append(job.name)
             return f"{job.name} died ({last_line}): failed {attempt} times, giving up; see {path}"
@@ -141,28 +141,27 @@ class Runner:
         return f"{job.name} died ({last_line}): resuming from its checkpoint, attempt {attempt + 1} of {attempts}"
 
     def _steps(self) -> int:
-        """Done by all runs; after the last one a run still evaluates."""
-        done = 0
-        for job in self.jobs:
-            whole = job.grid.steps
-            done += whole if job.name in self.finished else min(steps_done(self.runs / job.name), whole)
-        return done
+        """Count the training steps of all runs so far."""
+        return sum(
+            job.grid.steps if job.name in self.finished else min(steps_done(self.runs / job.name), job.grid.steps)
+            for job in self.jobs
+        )
 
     def conclude(self) -> int:
-        """Say what is finished and what failed; the exit code."""
+        """Print what is finished and what failed, and return the exit code."""
         print(f"{len(self.finished)} of {len(self.jobs)} runs finished, results in {self.results}")
         for name in self.failed:
             print(f"failed: {name}, {self.runs / name / 'traceback.txt'}")
         if self.failed:
             return FAILED
         if len(self.finished) < len(self.jobs):
-            print("stopped; the same command goes on")
+            print("stopped; the same command resumes")
             return STOPPED
         return FINISHED
 
     @contextmanager
     def _signals(self) -> Iterator[None]:
-        """The first Ctrl-C or SIGTERM stops in good order, the second at once."""
+        """Let the runs save checkpoints on the first Ctrl-C or SIGTERM, and stop at once on the second."""
 
         def stop(number: int, frame: FrameType | None) -> None:
             if self.stopping:
@@ -177,36 +176,33 @@ class Runner:
                 signal.signal(number, handler)
 
 
-def describe(grid: Grid, jobs: Sequence[Job], runner: Runner) -> str:
-    """What is about to happen."""
-    lines = [f"{grid.name}: {len(jobs)} runs of {grid.steps} steps, {len(runner.finished)} of them finished before"]
-    return "\n".join(lines + grid.overruled())
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Command line of ``python -m sb3_have.benchmark run``."""
     parser = argparse.ArgumentParser(
         prog="python -m sb3_have.benchmark run",
         description=(__doc__ or "").splitlines()[0],
-        epilog="Exit code: 0 if all runs are finished, 1 if some failed for good, 3 if stopped before the end.",
+        epilog="Exit code: 0 if all runs are finished, 1 if some failed, 3 if stopped before the end.",
     )
     parser.add_argument("grid", type=Path, help="YAML file, see sb3_have.benchmark.grid")
     parser.add_argument(
         "--address",
-        help="of a Ray cluster (auto, host:6379); RUNS must then be on a file system that all its machines share under "
-        "the same path",
+        help="address of a Ray cluster (auto, host:6379); RUNS must be on a file system that all of its machines share "
+        "under the same path",
     )
     parser.add_argument("--runs", type=Path, help="folder of the runs; default: runs/<name of the grid>")
-    parser.add_argument("--results", type=Path, help="default: benchmarks/results/<name of the grid>")
-    parser.add_argument("--workers", type=int, help="runs at a time; default: one for each CPU")
     parser.add_argument(
-        "--gpus", type=float, default=0.0, help="share of a GPU for each run, e.g. 0.125; default: none"
+        "--results", type=Path, help="folder of the results; default: benchmarks/results/<name of the grid>"
     )
-    parser.add_argument("--only", nargs="+", default=[], metavar="METHOD", help="leave the other methods out")
-    parser.add_argument("--time-limit", type=float, metavar="SECONDS", help="stop after that, as on Ctrl-C")
-    parser.add_argument("--retries", type=int, default=RETRIES, help="of a run that dies")
+    parser.add_argument("--workers", type=int, help="number of runs at a time; default: one for each CPU")
     parser.add_argument(
-        "--keep-checkpoints", action="store_true", help="of finished runs, so that a grid of more steps can go on"
+        "--gpus", type=float, default=0.0, help="share of a GPU for each run, such as 0.125; default: none"
+    )
+    parser.add_argument("--only", nargs="+", default=[], metavar="METHOD", help="run these methods only")
+    parser.add_argument("--time-limit", type=float, metavar="SECONDS", help="stop after this time, as on Ctrl-C")
+    parser.add_argument(
+        "--keep-checkpoints",
+        action="store_true",
+        help="keep the checkpoints of finished runs, so that a grid of more steps can continue them",
     )
     args = parser.parse_args(arguments)
     if args.workers is not None and args.workers < 1:
@@ -215,17 +211,16 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         grid = read_grid(args.grid)
         jobs = grid.jobs(args.only)
-        # Ray's workers need not have this directory
+        # Ray's workers may have another working directory
         runs = (args.runs or Path("runs") / grid.name).resolve()
         results = (args.results or Path("benchmarks") / "results" / grid.name).resolve()
         results.mkdir(parents=True, exist_ok=True)
         with locked(results):
-            runner = Runner(jobs, runs, results, args.retries, args.time_limit)
-            print(describe(grid, jobs, runner), flush=True)
+            runner = Runner(jobs, runs, results, time_limit=args.time_limit)
+            done = len(runner.finished)
+            print(f"{grid.name}: {len(jobs)} runs of {grid.steps} steps, {done} already finished", flush=True)
             if runner.is_done:
                 return runner.conclude()
-            if args.address is not None:
-                print(f"the machines of {args.address} must share {runs}")
             pool = RayPool(runs, args.address, args.workers, args.gpus, args.keep_checkpoints)
             try:
                 return runner.run(pool)
@@ -235,9 +230,5 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return FAILED
     except KeyboardInterrupt:
-        print("stopped at once; the same command goes on from the last checkpoints", file=sys.stderr)
+        print("stopped at once; the same command resumes from the last checkpoints", file=sys.stderr)
         return STOPPED
-
-
-if __name__ == "__main__":
-    sys.exit(main())

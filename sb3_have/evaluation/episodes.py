@@ -1,17 +1,19 @@
-"""Episodes with known weather and seed, one after the other, in the form in which a model reads them."""
+"""The one loop that drives episodes, and the environment that works through a queue of them."""
 
 from __future__ import annotations
 
 import multiprocessing
 import signal
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
+from copy import deepcopy
 from typing import Any, NamedTuple, Protocol
 
 import gymnasium as gym
 import numpy as np
-from gymnasium import spaces
-from stable_baselines3.common.vec_env import VecEnv, VecFrameStack, VecTransposeImage
+from stable_baselines3.common.vec_env import VecEnv
+
+Env = gym.Env[Any, Any]
 
 
 class Predictor(Protocol):
@@ -29,37 +31,36 @@ class Predictor(Protocol):
 class Task(NamedTuple):
     """One episode to drive.
 
-    :param weather: Weather in which to drive
+    :param weather: Weather of the episode
     :param seed: Seed of the episode
-    :param env_wrapper: Wrapper of the environment; tasks with the same object may share an environment
+    :param env_wrapper: Wrapper of the environment; tasks with the same wrapper object may share an environment
     """
 
     weather: str
     seed: int
-    env_wrapper: Callable[[gym.Env[Any, Any]], gym.Env[Any, Any]] | None = None
+    env_wrapper: Callable[[Env], Env] | None = None
 
 
 class EpisodeQueue(gym.Env[Any, Any]):
-    """Given episodes one after the other; ``reset`` takes the next one. It idles at no cost when none is left.
+    """An environment that works through a queue of episodes.
 
-    :param env_id: of the environment, made again when weather or wrapper change
-    :param tasks: the episodes with their numbers; several environments of one process may share a queue
-    :param env_kwargs: further keywords for ``gym.make``
+    ``reset`` takes the next episode. Once the queue is empty, the environment idles: it returns its last observation
+    without stepping.
+
+    :param make: Makes the environment of a task; it is called again when the weather or the wrapper changes
+    :param tasks: The episodes with their numbers; environments in the same process may share a queue
     """
 
-    def __init__(self, env_id: str, tasks: deque[tuple[int, Task]], env_kwargs: Mapping[str, Any]) -> None:
+    def __init__(self, make: Callable[[Task], Env], tasks: deque[tuple[int, Task]]) -> None:
         leave_interrupts_to_parent()
-        self._env_id, self._tasks, self._env_kwargs = env_id, tasks, dict(env_kwargs)
-        self._env = self._make(tasks[0][1])
+        self._make, self._tasks, self._made_for = make, tasks, tasks[0][1]
+        self._env = make(self._made_for)
+        # Number of the current episode, None if there is none left
         self.number: int | None = None
-        """Of the episode that is driven; None when none is left."""
-        self.observation_space, self.action_space = self._env.observation_space, self._env.action_space
-        self.render_mode, self.metadata = self._env.render_mode, self._env.metadata
-
-    def _make(self, task: Task) -> gym.Env[Any, Any]:
-        self._made_for = task
-        env: gym.Env[Any, Any] = gym.make(self._env_id, weather=task.weather, **self._env_kwargs)
-        return env if task.env_wrapper is None else task.env_wrapper(env)
+        # Copy the spaces because VecNormalize writes into the one that it gets
+        self.observation_space = deepcopy(self._env.observation_space)
+        self.action_space = deepcopy(self._env.action_space)
+        self.render_mode, self.metadata, self.spec = self._env.render_mode, self._env.metadata, self._env.spec
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         self.number = None
@@ -67,7 +68,7 @@ class EpisodeQueue(gym.Env[Any, Any]):
             self.number, task = self._tasks.popleft()
             if task._replace(seed=self._made_for.seed) != self._made_for:
                 self._env.close()
-                self._env = self._make(task)
+                self._env, self._made_for = self._make(task), task
             self.observation, self._info = self._env.reset(seed=task.seed)
         return self.observation, self._info
 
@@ -85,109 +86,75 @@ class EpisodeQueue(gym.Env[Any, Any]):
 
 
 def leave_interrupts_to_parent() -> None:
-    """In a worker process, ignore Ctrl-C: the terminal sends it to all, and the parent ends its workers itself."""
+    """Ignore Ctrl-C in a worker process: the terminal sends it to all processes, and the parent stops its workers."""
     if multiprocessing.parent_process() is not None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def drive(model: Predictor, vec_env: VecEnv, deterministic: bool = True) -> Iterator[tuple[int, dict[str, Any]]]:
-    """Drive the episodes of :class:`EpisodeQueue` environments, all environments by one ``predict``.
+class Step(NamedTuple):
+    """One step of n environments. Entries of environments without an episode have no meaning.
 
-    Environments with an empty queue are left out of the batch, so the rows of a batch may become fewer, unless the
-    model returns a recurrent ``state``, which has a row for every environment.
+    :param numbers: Number of the episode that each environment drives, None if it has none left
+    :param t: Steps of each episode before this one, shape (n,)
+    :param returns: Return of each episode before this step, shape (n,)
+    :param observations: The batch that the model read
+    :param infos: The ``info`` of each environment before the step
+    :param actions: What the model did, shape (n,) and that of an action
+    :param rewards: Shape (n,)
+    :param dones: Whether each episode ended with this step, shape (n,)
+    :param next_infos: The ``info`` of each environment after the step; of the old episode, if it ended
+    """
+
+    numbers: list[int | None]
+    t: np.ndarray
+    returns: np.ndarray
+    observations: Any
+    infos: list[dict[str, Any]]
+    actions: np.ndarray
+    rewards: np.ndarray
+    dones: np.ndarray
+    next_infos: list[dict[str, Any]]
+
+
+def drive(model: Predictor, vec_env: VecEnv, deterministic: bool = True) -> Iterator[Step]:
+    """Drive all episodes of :class:`EpisodeQueue` environments, with one ``predict`` for all environments.
+
+    Environments whose queue is empty are left out of the batch, unless the model returns a recurrent ``state``, which
+    has a row for every environment.
 
     :param model: The driver; a rule-based one gets every ``info`` through ``read_infos``
-    :param vec_env: n environments
+    :param vec_env: n environments, wrapped for the model
     :param deterministic: Whether to use deterministic actions
-    :return: The number of each episode as it ends, and its ``return, steps, distance, crashed, offroad``; a value that
-        the environment's ``info`` does not have is NaN
+    :return: Every step, right after the environments took it
     """
     observations = vec_env.reset()
-    infos: list[dict[str, Any]] = list(vec_env.unwrapped.reset_infos)
+    infos = list(vec_env.unwrapped.reset_infos)
     numbers: list[int | None] = vec_env.get_attr("number")
-    returns, steps = np.zeros(len(numbers)), np.zeros(len(numbers), dtype=int)
-    action_shape = (len(numbers), *(vec_env.action_space.shape or ()))
+    t, returns = np.zeros(len(numbers), dtype=int), np.zeros(len(numbers))
     state, starts = None, np.ones(len(numbers), dtype=bool)
     while any(number is not None for number in numbers):
+        # Choose the actions; the array is new in every step because environments may keep their row of it
         rows = [i for i, number in enumerate(numbers) if number is not None or state is not None]
         if hasattr(model, "read_infos"):
             model.read_infos([infos[i] for i in rows])
-        actions = np.zeros(action_shape, vec_env.action_space.dtype)  # environments may keep their row of it
-        actions[rows], state = model.predict(
-            _rows_of(observations, rows), state=state, episode_start=starts[rows], deterministic=deterministic
-        )
-        observations, rewards, starts, step_infos = vec_env.step(actions)
-        returns += rewards
-        steps += 1
-        infos = list(step_infos)
-        for i, number in enumerate(numbers):
-            if number is None or not starts[i]:
-                continue
-            outcome = {key: float(infos[i].get(key, np.nan)) for key in ("distance", "crashed", "offroad")}
-            yield number, {"return": returns[i], "steps": int(steps[i]), **outcome}
-            returns[i], steps[i] = 0.0, 0
-            # the newest info and number are those of the next episode, which the reset began
-            infos[i], numbers[i] = vec_env.unwrapped.reset_infos[i], vec_env.get_attr("number", indices=i)[0]
+        actions = np.zeros((len(numbers), *(vec_env.action_space.shape or ())), vec_env.action_space.dtype)
+        batch = _select(observations, rows)
+        actions[rows], state = model.predict(batch, state, starts[rows], deterministic=deterministic)
+
+        # Step the environments
+        next_observations, rewards, dones, next_infos = vec_env.step(actions)
+        next_infos = list(next_infos)
+        yield Step(numbers, t, returns, observations, infos, actions, rewards, dones, next_infos)
+
+        # SB3 has reset the environments whose episode ended: they drive the next one
+        t, returns, infos, numbers = t + 1, returns + rewards, [*next_infos], [*numbers]
+        for i in np.flatnonzero(dones).tolist():
+            t[i], returns[i], infos[i] = 0, 0.0, vec_env.unwrapped.reset_infos[i]
+            numbers[i] = vec_env.get_attr("number", indices=i)[0]
+        observations, starts = next_observations, dones
 
 
-def _rows_of(observations: Any, rows: list[int]) -> Any:
+def _select(observations: Any, rows: list[int]) -> Any:
     if isinstance(observations, dict):
-        return {key: part[rows] for key, part in observations.items()}
+        return {key: value[rows] for key, value in observations.items()}
     return observations[rows]
-
-
-def match_observations(vec_env: VecEnv, model: Any) -> VecEnv:
-    """Wrap an environment so that a model can read its observations.
-
-    :param vec_env: the bare environment, images channel-last
-    :param model: its ``observation_space`` decides: frames are stacked (``VecFrameStack``) and images transposed
-        (``VecTransposeImage``) where that makes the spaces equal; without one, nothing is done
-    :raises ValueError: if they cannot be made equal, or the model's environment normalises observations by a
-        ``VecNormalize`` (a model loaded without its environment does not tell)
-    """
-    wanted: spaces.Space[Any] | None = getattr(model, "observation_space", None)
-    if wanted is None:
-        return vec_env
-    normalizer = getattr(model, "get_vec_normalize_env", lambda: None)()
-    if normalizer is not None and normalizer.norm_obs:
-        raise ValueError(
-            "the model was trained under VecNormalize, whose statistics evaluate() does not have; "
-            "use stable_baselines3.common.evaluation.evaluate_policy with the saved VecNormalize"
-        )
-    n_stack = _frame_count(vec_env.observation_space, wanted)
-    if n_stack > 1:
-        vec_env = VecFrameStack(vec_env, n_stack)
-    if vec_env.observation_space != wanted and _has_image(vec_env.observation_space):
-        vec_env = VecTransposeImage(vec_env)
-    if vec_env.observation_space != wanted:
-        raise _mismatch(vec_env.observation_space, wanted)
-    return vec_env
-
-
-def _parts(space: spaces.Space[Any]) -> dict[str, spaces.Space[Any]]:
-    return dict(space.spaces) if isinstance(space, spaces.Dict) else {"observation": space}
-
-
-def _has_image(space: spaces.Space[Any]) -> bool:
-    return any(len(part.shape or ()) == 3 for part in _parts(space).values())
-
-
-def _frame_count(space: spaces.Space[Any], wanted: spaces.Space[Any]) -> int:
-    """How many frames of ``space`` make ``wanted``."""
-    given, asked = _parts(space), _parts(wanted)
-    if set(given) != set(asked):
-        raise _mismatch(space, wanted)
-    counts = {np.prod(asked[key].shape or (1,)) / np.prod(given[key].shape or (1,)) for key in given}
-    count = counts.pop()
-    if counts or count < 1 or count % 1:
-        raise _mismatch(space, wanted)
-    return int(count)
-
-
-def _mismatch(space: spaces.Space[Any], wanted: spaces.Space[Any]) -> ValueError:
-    given, asked = _parts(space), _parts(wanted)
-    lines = [f"  {key}: the model has {asked.get(key)}, the environment {given.get(key)}" for key in {**asked, **given}]
-    return ValueError(
-        "the model's observations cannot be made from the environment's by stacking frames; "
-        "give evaluate() the env_kwargs of the training (modalities, image_size, ...)\n" + "\n".join(lines)
-    )

@@ -1,4 +1,4 @@
-"""An environment of one's own, wrapped as that of a model's training was."""
+"""Wrap an environment as in the training of a model."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
 from stable_baselines3.common.vec_env import (
     VecEnv,
     VecEnvWrapper,
@@ -19,76 +21,55 @@ from stable_baselines3.common.vec_env import (
 from stable_baselines3.common.vec_env.stacked_observations import StackedObservations
 
 from sb3_have.checkpoint.archive import loads, read_archive
-from sb3_have.evaluation.episodes import match_observations
 
 
 def wrap_as_trained(vec_env: VecEnv, model: Any, normalizer: VecNormalize | None = None) -> VecEnv:
-    """Wrap an environment so that a model reads it as it reads its own.
+    """Wrap an environment so that a model reads it as in training.
 
-    :param vec_env: the bare environment
-    :param model: a model that has its training environment, whose ``VecFrameStack``, ``VecNormalize`` (a copy of its
-        statistics, which no longer change), ``VecTransposeImage`` and ``VecExtractDictObs`` are put on in the same
-        order; without one, see :func:`~sb3_have.evaluation.episodes.match_observations`
-    :param normalizer: of the training of a model without its environment; see :func:`saved_normalizer`
-    :return: rewards are not normalised
-    :raises ValueError: if the result has not the observation space of the model, another wrapper of the training
-        changed the observations, or the normalizer's statistics are of other shapes, as those of one within
-        ``VecFrameStack`` are
+    :param vec_env: The bare environment, images channel-last
+    :param model: If it has its training environment, the wrappers of that one are repeated: ``VecFrameStack``,
+        ``VecNormalize`` (with a copy of its statistics, which are not updated), ``VecTransposeImage`` and
+        ``VecExtractDictObs``. Otherwise frames are stacked and images transposed as its ``observation_space`` requires.
+        A rule-based driver, which has neither, gets the bare environment.
+    :param normalizer: ``VecNormalize`` of the training, for a model without its environment
+    :return: The wrapped environment; rewards are not normalised
+    :raises ValueError: If the observations do not fit the model, or the training environment has another wrapper that
+        changes them
     """
+    expected = getattr(model, "observation_space", None)
     trained: VecEnv | None = getattr(model, "get_env", lambda: None)()
+    layers: list[VecEnvWrapper] = []
     if trained is None:
-        vec_env = match_observations(vec_env, model)
-        return vec_env if normalizer is None else _same_layer(normalizer, vec_env)
-    layers = []
+        vec_env = vec_env if expected is None else _stack_and_transpose(vec_env, expected)
+        layers = [] if normalizer is None else [normalizer]
     while isinstance(trained, VecEnvWrapper):
-        layers.append(trained)
+        layers.insert(0, trained)
         trained = trained.venv
-    for layer in reversed(layers):
-        vec_env = _same_layer(layer, vec_env)
-    if vec_env.observation_space != model.observation_space:
+    for layer in layers:
+        vec_env = _repeat(layer, vec_env)
+    if expected is not None and vec_env.observation_space != expected:
         raise ValueError(
-            f"the environment's observations do not fit the model:\n  the model has {model.observation_space}\n"
-            f"  the environment {vec_env.observation_space}, wrapped as in training; make it as that of the training"
+            "the environment's observations do not fit the model; use the env_kwargs of the training (modalities, "
+            f"image_size, ...)\n{_differences(expected, vec_env.observation_space)}"
         )
     return vec_env
 
 
-def saved_normalizer(file: Path) -> VecNormalize | None:
-    """The ``VecNormalize`` that a model was trained under, without its environment.
-
-    :param file: a checkpoint, or what ``VecNormalize.save`` wrote; it is unpickled. Of a subclass, a checkpoint gives
-        the statistics as VecNormalize
-    :return: None if a checkpoint has none
-    :raises ValueError: if something else is pickled in the file
-    """
-    if not zipfile.is_zipfile(file):
-        with file.open("rb") as pickled:
-            saved = pickle.load(pickled)
-        if not isinstance(saved, VecNormalize):
-            raise ValueError(f"{file} holds a {type(saved).__name__}, not a VecNormalize")
-        return saved
-    with zipfile.ZipFile(file) as archive:
-        if b"norm_obs" not in archive.read("state.pkl"):
-            return None  # which spares us the replay buffer
-    layers = read_archive(file)[2]["environments"].layers
-    states, *_ = loads(layers.pickled, [_Absent()] * len(layers.names))
-    for state in states:
-        if state.keys() >= {"norm_obs", "clip_obs", "ret_rms"}:  # subclasses have other names
-            normalizer = VecNormalize.__new__(VecNormalize)
-            vars(normalizer).update(state)
-            return normalizer
-    return None
+def _stack_and_transpose(vec_env: VecEnv, expected: spaces.Space[Any]) -> VecEnv:
+    """Stack frames if the model reads a multiple of the numbers, then transpose images if the spaces match only so."""
+    n_stack = spaces.flatdim(expected) / spaces.flatdim(vec_env.observation_space)
+    if n_stack > 1 and n_stack.is_integer():
+        vec_env = VecFrameStack(vec_env, int(n_stack))
+    space = vec_env.observation_space
+    parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
+    if space != expected and any(map(is_image_space, parts)):
+        transposed = VecTransposeImage(vec_env)
+        return transposed if transposed.observation_space == expected else vec_env
+    return vec_env
 
 
-class _Absent:
-    """An environment, and all that it has, for those who need neither."""
-
-    def __getattr__(self, name: str) -> _Absent:
-        return self
-
-
-def _same_layer(layer: VecEnvWrapper, vec_env: VecEnv) -> VecEnv:
-    """``vec_env`` with one more wrapper, or as it is if the wrapper does not change observations."""
+def _repeat(layer: VecEnvWrapper, vec_env: VecEnv) -> VecEnv:
+    """Wrap an environment as ``layer`` wraps its own; a wrapper that leaves observations alone is left out."""
     if isinstance(layer, VecFrameStack):
         stacked = layer.stacked_obs
         order: Any = {key: _order(part) for key, part in getattr(stacked, "sub_stacked_observations", {}).items()}
@@ -101,27 +82,56 @@ def _same_layer(layer: VecEnvWrapper, vec_env: VecEnv) -> VecEnv:
         options = {name: getattr(layer, name) for name in ("norm_obs", "norm_obs_keys", "clip_obs", "epsilon")}
         normalized = VecNormalize(vec_env, training=False, norm_reward=False, **options)
         if layer.norm_obs:
-            if (found := _shapes(layer)) != (expected := _shapes(normalized)):
-                raise ValueError(
-                    f"the statistics of VecNormalize have the shapes {found}, and the observations that the model "
-                    f"reads {expected}: in training it stood elsewhere among the wrappers (within VecFrameStack or "
-                    "VecTransposeImage), or was another one; load the model with its environment"
-                )
             normalized.obs_rms = deepcopy(layer.obs_rms)
         return normalized
     if layer.observation_space != layer.venv.observation_space:
         raise ValueError(
-            f"{type(layer).__name__} changed the observations of the training and is not known here; "
-            "do the same by a gymnasium wrapper on the environment"
+            f"{type(layer).__name__} changed the observations in training, and cannot be repeated here; "
+            "use a gymnasium wrapper on the environment instead"
         )
     return vec_env
 
 
-def _shapes(normalizer: VecNormalize) -> dict[str, tuple[int, ...]]:
-    statistics: Any = normalizer.obs_rms
-    parts = statistics if isinstance(statistics, dict) else {"observation": statistics}
-    return {key: part.mean.shape for key, part in parts.items()}
-
-
 def _order(stacked: StackedObservations[Any]) -> str:
     return "first" if stacked.channels_first else "last"
+
+
+def _differences(expected: spaces.Space[Any], given: spaces.Space[Any]) -> str:
+    parts = [dict(s.spaces) if isinstance(s, spaces.Dict) else {"observation": s} for s in (expected, given)]
+    keys = dict.fromkeys([*parts[0], *parts[1]])
+    return "\n".join(f"  {key}: the model has {parts[0].get(key)}, the environment {parts[1].get(key)}" for key in keys)
+
+
+def saved_normalizer(file: Path) -> VecNormalize | None:
+    """Read the ``VecNormalize`` of a training from a file, which is unpickled.
+
+    :param file: A checkpoint, or a file that ``VecNormalize.save`` wrote
+    :return: None if a checkpoint has none
+    :raises ValueError: If the file holds another pickled object
+    """
+    if not zipfile.is_zipfile(file):
+        with file.open("rb") as pickled:
+            saved = pickle.load(pickled)
+        if not isinstance(saved, VecNormalize):
+            raise ValueError(f"{file} holds a {type(saved).__name__}, not a VecNormalize")
+        return saved
+    with zipfile.ZipFile(file) as archive:
+        # Avoid reading the replay buffer where there is nothing to find
+        if b"norm_obs" not in archive.read("state.pkl"):
+            return None
+    layers = read_archive(file)[2]["environments"].layers
+    states, *_ = loads(layers.pickled, [_Absent()] * len(layers.names))
+    for state in states:
+        # Subclasses of VecNormalize have other names
+        if state.keys() >= {"norm_obs", "clip_obs", "ret_rms"}:
+            normalizer = VecNormalize.__new__(VecNormalize)
+            vars(normalizer).update(state)
+            return normalizer
+    return None
+
+
+class _Absent:
+    """Stands for the environments that a checkpoint refers to, and for all their attributes."""
+
+    def __getattr__(self, name: str) -> _Absent:
+        return self

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter
 from stable_baselines3.common.monitor import load_results
 
-from sb3_have.evaluation.evaluation import iqm, mean, stratified_bootstrap
+from sb3_have.evaluation.statistics import iqm, mean, stratified_bootstrap
 from sb3_have.plotting.style import CURVES, SMALL, Style, draw_curve, draw_levels
 
 STATISTICS = {"mean": mean, "iqm": iqm}
@@ -89,7 +89,7 @@ def plot_learning_curves(
     :param confidence: of the band, which a single run has not
     :param references: levels to draw by name, such as the mean of another driver
     :param styles: looks of some methods; the others have :data:`~sb3_have.plotting.style.CURVES` in order
-    :param n_resamples: of the bootstrap, see :func:`~sb3_have.evaluation.evaluation.stratified_bootstrap`
+    :param n_resamples: of the bootstrap, see :func:`~sb3_have.evaluation.statistics.stratified_bootstrap`
     :raises ValueError: if there is nothing to draw, or no such statistic
     """
     if not curves:

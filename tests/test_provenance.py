@@ -1,4 +1,4 @@
-"""With what a measurement was made."""
+"""The machine and the versions of a measurement."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import gymnasium
 import pytest
 
 import sb3_have
-from sb3_have.benchmark import machine as module
-from sb3_have.benchmark.machine import commit_of, machine
+from sb3_have.benchmark import provenance
+from sb3_have.benchmark.provenance import commit_of, machine
 
 
 def test_versions_name_what_results_depend_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "COMMIT", "0123456789")
+    monkeypatch.setattr(provenance, "COMMIT", "0123456789")
     versions = machine()["versions"]
     assert versions.startswith(f"sb3_have {sb3_have.__version__} (0123456789), Python 3.")
     names = ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "highway-env", "numpy", "opencv")
     assert all(re.search(rf", {name} \d[^,]*", versions) for name in names)
     assert f"gymnasium {gymnasium.__version__}," in versions
-    monkeypatch.setattr(module, "COMMIT", None)  # as from a wheel
+    monkeypatch.setattr(provenance, "COMMIT", None)  # as from a wheel
     assert machine()["versions"].startswith(f"sb3_have {sb3_have.__version__}, Python")
 
 
 def test_commit_of_a_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def git(*args: str) -> str:
         who = ["-c", "user.name=a", "-c", "user.email=a@b.c", "-c", "init.defaultBranch=main"]
-        told = subprocess.run(["git", "-C", str(tmp_path), *who, *args], check=True, capture_output=True, text=True)
-        return told.stdout.strip()
+        done = subprocess.run(["git", "-C", str(tmp_path), *who, *args], check=True, capture_output=True, text=True)
+        return done.stdout.strip()
 
     assert commit_of(tmp_path) is None
     git("init")
