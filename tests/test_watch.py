@@ -84,7 +84,7 @@ def test_mp4_has_a_frame_a_step_and_is_read_back(library: str, tmp_path: Path, m
 def test_frames_of_a_film_are_not_kept_and_a_broken_one_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(animation, "_write_by_ffmpeg", animation._write_by_opencv)
+    monkeypatch.setattr(animation, "_write_with_ffmpeg", animation._write_with_opencv)
     drawn: list[weakref.ref[Image.Image]] = []
 
     def frames(breaks: bool) -> Iterator[Image.Image]:
