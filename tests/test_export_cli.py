@@ -59,6 +59,7 @@ def test_wrong_files(tmp_path: Path, zipped: Path) -> None:
     assert "text is not a model that SB3 saved" in run(tmp_path / "text", *to_onnx)
     PPO("MlpPolicy", RandomSensors(vector(3)), device="cpu").save(tmp_path / "ppo.zip")
     assert "ppo.zip" in run(tmp_path / "ppo.zip", *to_onnx)
+    assert "model.zip was saved by havesac, not by tqc" in run(zipped, *to_onnx, "--algo", "tqc")
     assert f"File exists: '{zipped}'" in run(zipped, "--format", "safetensors", "--out", zipped)
     sac = SAC("MultiInputPolicy", RandomSensors(spaces.Dict({"a": vector(2), "b": spaces.Discrete(2)})), buffer_size=50)
     sac.save(zipped)

@@ -62,7 +62,11 @@ def load_zip(path: Path, algo: str | None = None) -> BaseAlgorithm:
     :param path: The zip
     :param algo: Name of the algorithm; by default that of the policy, and HAVESAC for your own policies
     """
-    model = algorithms()[algo or saved_algorithm(path, path) or "havesac"].load(path, device="cpu", buffer_size=1)
+    known = saved_algorithm(path, path)
+    name = algo or known or "havesac"
+    if known not in (None, name):
+        raise ValueError(f"{path} was saved by {known}, not by {name}: leave out --algo")
+    model = algorithms()[name].load(path, device="cpu", buffer_size=1)
     # A zip does not say whether the model was trained under VecNormalize; SB3 and the Zoo save the statistics nearby
     for file in sorted([*path.parent.glob("*vecnormalize*.pkl"), *path.parent.glob("*/*vecnormalize*.pkl")]):
         print(f"{file}: if the model was trained under VecNormalize, {NORMALIZED}", file=sys.stderr)
