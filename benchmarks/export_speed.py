@@ -4,8 +4,8 @@ Latency of one action in onnxruntime and in PyTorch, and the sizes of the files.
     OMP_NUM_THREADS=1 python -m benchmarks.export_speed
 
 The policy is HAVESAC's with its defaults and untrained weights, on three frames of rgb and event images with 64 pixels,
-a batch of one and one thread. The contenders take turns in one process with the same observation. These rows are printed
-and written to benchmarks/results/export_speed.csv:
+a batch of one and one thread. The contenders take turns in one process with the same observation. These rows are
+printed and written to benchmarks/results/export_speed.csv:
 
 - ``predict``: the model, with image encoders in float32 and, if the processor supports it, bfloat16;
 - ``predict, loaded``: the policy read by ``load_policy``, in float32;
