@@ -1,19 +1,20 @@
-"""Latency of one action: onnxruntime beside PyTorch's ``predict``, and the sizes of the files.
+"""
+Latency of one action in onnxruntime and in PyTorch, and the sizes of the files.
 
     OMP_NUM_THREADS=1 python -m benchmarks.export_speed
 
-The policy is HAVESAC's with its defaults and new weights, on three frames of rgb and event images of 64 pixels, a batch
-of one, one thread. The contenders take turns in one process, on the same observation. Rows, printed and written to
-benchmarks/results/export_speed.csv:
+The policy is HAVESAC's with its defaults and untrained weights, on three frames of rgb and event images with 64 pixels,
+a batch of one and one thread. The contenders take turns in one process with the same observation. These rows are
+printed and written to benchmarks/results/export_speed.csv:
 
-- ``predict``: of the model, with image encoders in float32 and, where the processor has it, bfloat16;
-- ``predict, loaded``: of the policy that ``load_policy`` reads, in float32;
-- ``onnxruntime``: the action by the file of ``export_onnx``; ``onnxruntime, with weights``: the modalities' too.
+- ``predict``: the model, with image encoders in float32 and, if the processor supports it, bfloat16;
+- ``predict, loaded``: the policy read by ``load_policy``, in float32;
+- ``onnxruntime``: the action from the file of ``export_onnx``; ``onnxruntime, with weights``: with modality weights.
 
-Columns: median and quartiles of the wall-clock time of a call; ``cpu_ms``, median processor time, which says more on a
-machine with other work; ``vs_predict``, how many times faster than ``predict`` in float32, the median over the rounds
-of the ratio within a round, in processor time; ``size_mb``, of what is copied to where it runs: SB3's zip (untrained;
-the optimizers' state comes on top), the folder, the file.
+Columns: median and quartiles of the wall-clock time of a call; ``cpu_ms``, the median processor time, which is more
+reliable on a busy machine; ``vs_predict``, the speed relative to ``predict`` in float32 (the median over the rounds of
+the ratio of processor times in a round); ``size_mb``, the size of what has to be deployed: SB3's zip (untrained, so
+without the state of the optimizers), the folder, or the file.
 """
 
 from __future__ import annotations
@@ -41,13 +42,13 @@ BASELINE: Contender = ("predict", "float32")
 
 
 def size_mb(path: Path) -> float:
-    """Size of a file or of the files in a folder."""
+    """Return the size of a file or of the files in a folder."""
     files = path.iterdir() if path.is_dir() else [path]
     return round(sum(file.stat().st_size for file in files) / 1e6, 3)
 
 
 def measure(args: argparse.Namespace, folder: Path) -> list[Row]:
-    """Rows of all contenders; the files are written into ``folder``."""
+    """Return the rows of all contenders; ``folder`` is for their files."""
     env = make_env({name: CHANNELS[name] for name in MODALITIES}, args.image_size, args.n_stack)
     models = {
         precision: HAVESAC(
@@ -94,7 +95,7 @@ def main() -> None:
     parser.add_argument("--image-size", type=int, default=64)
     parser.add_argument("--n-stack", type=int, default=3, help="frames")
     parser.add_argument("--rounds", type=int, default=60)
-    parser.add_argument("--repeats", type=int, default=3, help="calls of each contender in each round")
+    parser.add_argument("--repeats", type=int, default=3, help="calls of each contender per round")
     parser.add_argument("--out", type=Path, default=RESULTS / "export_speed.csv")
     args = parser.parse_args()
     th.set_num_threads(1)

@@ -1,8 +1,9 @@
-"""Train HAVESAC on HighwayVision-v0 for some minutes, compare it with rule-based drivers, and show what it does.
+"""
+Train HAVESAC on HighwayVision-v0 for a few minutes, compare it with rule-based drivers, and film an episode.
 
     python -m sb3_have.demo [--steps N] [--seed S] [--out runs/demo]
 
-Hyper-parameters are those of ``zoo_configs/havesac.yml``; :mod:`sb3_have.train` is the same for a long run.
+Hyperparameters are those of ``zoo_configs/havesac.yml``. Use :mod:`sb3_have.train` for longer runs.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ from sb3_have.train import Run
 
 ENV_ID = "HighwayVision-v0"
 STEPS = 10_000
+# Limit of the training, so that the demo takes at most a quarter of an hour on two cores; the evaluation takes 2.4
 MINUTES = 11.5
-"""Training stops here, so that the demo stays within a quarter of an hour on two cores; evaluation took 2.4 there."""
 EPISODES = 2
 PROCESSES = 2
 SHOWN = "HardRainNight"
@@ -42,43 +43,48 @@ SHOWN = "HardRainNight"
 
 def main(arguments: list[str] | None = None) -> None:
     """Command line of ``python -m sb3_have.demo``."""
-    parser = argparse.ArgumentParser(prog="python -m sb3_have.demo", description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_have.demo", description=(__doc__ or "").strip().splitlines()[0]
+    )
     steps = int(os.environ.get("DEMO_STEPS", STEPS))
-    parser.add_argument("--steps", type=int, default=steps, help=f"of training; default: $DEMO_STEPS or {STEPS}")
-    parser.add_argument("--minutes", type=float, default=MINUTES, help="of training at most; default: %(default)s")
-    parser.add_argument("--episodes", type=int, default=EPISODES, help="per weather and driver; default: %(default)s")
+    parser.add_argument("--steps", type=int, default=steps, help=f"training steps; default: $DEMO_STEPS or {STEPS}")
+    parser.add_argument("--minutes", type=float, default=MINUTES, help="limit of the training; default: %(default)s")
+    parser.add_argument(
+        "--episodes", type=int, default=EPISODES, help="episodes per weather and driver; default: %(default)s"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("runs/demo"))
     args = parser.parse_args(arguments)
     try:
         demo(args.steps, 60 * args.minutes, args.episodes, args.seed, args.out)
     except KeyboardInterrupt:
-        print(f"\nInterrupted; what was finished is in {args.out}.", file=sys.stderr)
+        print(f"\nInterrupted, the results so far are in {args.out}.", file=sys.stderr)
         sys.exit(130)
 
 
 def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -> dict[str, pd.DataFrame]:
-    """Train, evaluate, draw.
+    """
+    Train, evaluate and draw.
 
-    :param steps: of training
-    :param time_limit: of the training [s]
-    :param n_episodes: to evaluate each driver with in each weather
-    :param seed: of training; the evaluation's episodes are the same for every seed
-    :param out: folder for the results
-    :return: the evaluation of each driver
+    :param steps: Number of training steps
+    :param time_limit: Limit of the training [s]
+    :param n_episodes: Number of evaluation episodes for each driver in each weather
+    :param seed: Seed of the training; the evaluation always uses the same episodes
+    :param out: Folder for the results
+    :return: Evaluation of each driver
     """
     started = time.monotonic()
     config = load_config("havesac", ENV_ID)
     run = Run(config, ENV_ID, out, seed=seed, eval_freq=0, save_freq=0, time_limit=time_limit)
-    with phase(f"Training for {steps} steps or {time_limit / 60:g} minutes (Ctrl-C: go on with what is learned)"):
+    with phase(f"Training for {steps} steps or {time_limit / 60:g} minutes (Ctrl-C to stop earlier)"):
         model = run.train(steps, progress_bar=True, keep_checkpoint=False)
-        if not (out / "model.zip").exists():  # interrupted for the second time, in the middle of a step
+        if not (out / "model.zip").exists():  # interrupted twice, or before the first step
             raise KeyboardInterrupt
         (out / "model.zip").replace(out / "havesac_demo.zip")
-        each = 1e3 * run.seconds / max(1, model.num_timesteps)
-        print(f"{model.num_timesteps} steps in {run.seconds:.0f} s, {each:.0f} ms each")
+        milliseconds = 1e3 * run.seconds / max(1, model.num_timesteps)
+        print(f"{model.num_timesteps} steps in {run.seconds:.0f} s, {milliseconds:.0f} ms per step")
 
-    # the environments' processes need the cores now
+    # Leave the cores to the processes of the environments
     th.set_num_threads(1)
     env_kwargs = evaluation_env_kwargs(config)
     drivers: dict[str, Predictor] = {
@@ -112,12 +118,13 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
 
 
 def draw(model: Any, results: dict[str, pd.DataFrame], env_kwargs: dict[str, Any], out: Path) -> None:
-    """Write the pictures of the demo.
+    """
+    Write the figures and the film.
 
-    :param model: trained
-    :param results: of :func:`evaluate`, by driver
-    :param env_kwargs: of the evaluation
-    :param out: folder, with the ``monitor.csv`` of the training
+    :param model: The trained model
+    :param results: Evaluation of each driver
+    :param env_kwargs: Keyword arguments of the environment
+    :param out: Folder for the results, with the ``monitor.csv`` of the training
     """
     others = {name: float(frame["distance_mean"].mean()) for name, frame in results.items() if name != "HAVESAC"}
     curve = plot_learning_curve(load_results(str(out)), references=others)
@@ -129,9 +136,10 @@ def draw(model: Any, results: dict[str, pd.DataFrame], env_kwargs: dict[str, Any
 
 @contextmanager
 def phase(title: str) -> Iterator[None]:
-    """Print what happens and how long it took.
+    """
+    Print the title and the duration of a phase.
 
-    :param title: of the phase
+    :param title: Title of the phase
     """
     print(f"\n== {title}", flush=True)
     started = time.monotonic()

@@ -1,12 +1,13 @@
-"""Film a trained model: an episode with what the sensors saw, the live weights of the modalities, speed and return.
+"""
+Film a trained model: an episode with the sensors' images, the modality weights, speed, distance, return and value.
 
     python -m sb3_have.watch runs/have-0 --weather HardRainNight --out drive.mp4
 
-MODEL is a zip that SB3 saved, a checkpoint, or the folder of a run of ``python -m sb3_have.train``, whose settings then
-tell the environment. Without them it is HighwayVision-v0 as in ``--config``, with the modalities and the image size
-that the model reads; ``--env`` and ``--env-kwargs`` name another one. Statistics of ``VecNormalize`` are those of the
-checkpoint, else of ``vecnormalize.pkl`` beside the model or where the Zoo puts it; a model's zip does not tell whether
-it needs them. The ending of ``--out`` decides between mp4 and GIF.
+MODEL is a zip that SB3 saved, a checkpoint, or the folder of a run of ``python -m sb3_have.train``. The settings of a
+run include its environment. Without them it is HighwayVision-v0 as in ``--config``, with the modalities and the image
+size that the model was trained with, unless ``--env`` and ``--env-kwargs`` name another one. The statistics of
+``VecNormalize`` are read from the checkpoint, or from ``vecnormalize.pkl`` beside the model or where the Zoo saves it;
+the zip of a model does not show whether it needs them.
 """
 
 from __future__ import annotations
@@ -36,15 +37,15 @@ from sb3_have.plotting import write_animation
 from sb3_have.train import algorithms
 
 ENV_ID = "HighwayVision-v0"
+# Environments with the keywords `modalities` and `image_size`
 CAMERAS = (ENV_ID, "CarlaVision-v0")
-"""Environments with the keywords ``modalities`` and ``image_size``."""
 
 
 def model_file(path: Path) -> Path:
-    """The file that holds a model.
+    """
+    Find the file of a model.
 
-    :param path: a model, with or without the ending zip, a checkpoint, or a folder with ``model.zip`` or checkpoints
-    :raises FileNotFoundError: if there is none
+    :param path: A model, with or without the ending zip, a checkpoint, or a folder with ``model.zip`` or checkpoints
     """
     if path.is_dir():
         candidates = [path / "model.zip", *reversed(checkpoints(path))]
@@ -53,30 +54,25 @@ def model_file(path: Path) -> Path:
     for candidate in candidates:
         if candidate.is_file():
             return candidate
-    looked = (
-        f"{path / 'model.zip'} and {path / 'checkpoint-<step>'}"
-        if path.is_dir()
-        else " and ".join(map(str, candidates))
-    )
-    raise FileNotFoundError(f"there is no model: looked for {looked}")
+    raise FileNotFoundError(f"{path} is neither a model nor a folder with model.zip or checkpoints")
 
 
 def read_model(file: Path) -> tuple[io.BytesIO, dict[str, Any]]:
-    """A model as SB3 saved it, and what is known of its training; nothing is unpickled.
+    """
+    Read a model and the settings of its run without unpickling anything.
 
-    :param file: a model or a checkpoint
-    :return: the model's zip; ``config``, ``env_id`` ... of the run of :mod:`sb3_have.train` that it is of, told by the
-        checkpoint or by one beside its ``model.zip``, else empty
-    :raises ValueError: if it is neither, or damaged
+    :param file: A model or a checkpoint
+    :return: The zip of the model, and ``env_id``, ``config`` and so on if :mod:`sb3_have.train` trained it; they are
+        in the checkpoint, or in one beside ``model.zip``
     """
     try:
         with zipfile.ZipFile(file) as archive:
             if "info.json" in archive.namelist():
-                told = json.loads(archive.read("info.json"))
-                return io.BytesIO(archive.read("model.zip")), dict(told.get("info", {}).get("settings", {}))
+                info = json.loads(archive.read("info.json"))
+                return io.BytesIO(archive.read("model.zip")), dict(info.get("info", {}).get("settings", {}))
     except (zipfile.BadZipFile, KeyError, ValueError) as error:
-        raise ValueError(f"{file} is not a model that SB3's save() wrote, or it is damaged: {error}") from error
-    # a model of another name may be of anywhere
+        raise ValueError(f"{file} is not a model that SB3 saved, or it is damaged: {error}") from error
+    # A model with another name may not belong to the run
     for checkpoint in reversed(checkpoints(file.parent) if file.name == "model.zip" else []):
         with suppress(DamagedCheckpointError):
             return io.BytesIO(file.read_bytes()), dict(checkpoint_info(checkpoint)["info"].get("settings", {}))
@@ -84,38 +80,38 @@ def read_model(file: Path) -> tuple[io.BytesIO, dict[str, Any]]:
 
 
 def load_model(file: Path, algo: str | None = None, device: str = "auto") -> tuple[BaseAlgorithm, dict[str, Any]]:
-    """Load a model to watch it, with a small replay buffer.
+    """
+    Load a model with a small replay buffer. This unpickles the file, as SB3 does.
 
-    :param file: a model or a checkpoint; the model is unpickled, as SB3 does
-    :param algo: name in :func:`sb3_have.train.algorithms`; None is the one that saved it
-    :param device: of the model
-    :return: the model and the settings of its run, see :func:`read_model`
-    :raises ValueError: if the file is no model, or of another algorithm
+    :param file: A model or a checkpoint
+    :param algo: Name of the algorithm; by default the one that saved the model
+    :param device: Device of the model
+    :return: The model and the settings of its run, see :func:`read_model`
     """
     saved, settings = read_model(file)
     known = saved_algorithm(saved, file)
     name = algo or known or "havesac"
-    if known is not None and name != known:
-        raise ValueError(f"{file} was saved by {known}, not by {name}: leave --algo out")
+    if known not in (None, name):
+        raise ValueError(f"{file} was saved by {known}, not by {name}: leave out --algo")
     try:
         model = algorithms()[name].load(saved, device=device, custom_objects={"buffer_size": 1000})
-    except Exception as error:  # whatever a file of another kind makes SB3 stumble over
-        raise ValueError(f"{file} cannot be loaded as {name}, give its --algo: {error!r}") from error
+    except Exception as error:  # whatever SB3 raises for a file of another kind
+        raise ValueError(f"{file} cannot be loaded as {name}, try --algo: {error!r}") from error
     return model, settings
 
 
 def fitting_env_kwargs(space: spaces.Space[Any]) -> dict[str, Any]:
-    """``modalities`` and ``image_size`` of a camera environment from the observation space of a model.
+    """
+    Return the ``modalities`` and the ``image_size`` of a camera environment that a model can be driven in.
 
-    :param space: of the model, images channel-first or -last
-    :raises ValueError: if it has anything but images of the known modalities
+    :param space: Observation space of the model
     """
     parts = dict(space.spaces) if isinstance(space, spaces.Dict) else {"observation": space}
     shapes = [part.shape or () for part in parts.values()]
     if not set(parts) <= set(MODALITIES) or any(len(shape) != 3 for shape in shapes):
         raise ValueError(
-            f"the model reads {', '.join(parts)}, not images of {', '.join(MODALITIES)}: "
-            "give the environment that it was trained in by --env and --env-kwargs"
+            f"the model reads {', '.join(parts)} instead of images of {', '.join(MODALITIES)}: name the environment "
+            "that it was trained in with --env and --env-kwargs"
         )
     return {"modalities": [name for name in MODALITIES if name in parts], "image_size": sorted(shapes[0])[-1]}
 
@@ -123,13 +119,14 @@ def fitting_env_kwargs(space: spaces.Space[Any]) -> dict[str, Any]:
 def environment(
     model: BaseAlgorithm, settings: Mapping[str, Any], env_id: str | None, config: str
 ) -> tuple[str, dict[str, Any], Mapping[str, Any]]:
-    """Where to drive a model.
+    """
+    Choose the environment to drive a model in.
 
-    :param model: tells modalities and image size where nothing else does
-    :param settings: of its run, may be empty
-    :param env_id: to use in place of the run's
-    :param config: configuration of ``zoo_configs`` for what the run does not tell
-    :return: id, keywords, and the configuration with an ``env_wrapper``, if any
+    :param model: The model
+    :param settings: Settings of its run, if known
+    :param env_id: Replaces the environment of the run
+    :param config: Configuration that has the environment if the settings do not
+    :return: Environment id, keyword arguments, and a configuration that may have an ``env_wrapper``
     """
     if settings and env_id in (None, settings["env_id"]):
         return settings["env_id"], dict(settings["config"].get("env_kwargs", {})), settings["config"]
@@ -141,10 +138,11 @@ def environment(
 
 
 def statistics_file(file: Path, env_id: str) -> Path | None:
-    """Where the statistics of the ``VecNormalize`` of a model's training may be, None if nowhere.
+    """
+    Find the statistics of ``VecNormalize``.
 
-    :param file: a model or a checkpoint
-    :param env_id: of its environment, by which the Zoo calls the folder
+    :param file: A model or a checkpoint
+    :param env_id: Its environment, after which the Zoo names a folder
     """
     with zipfile.ZipFile(file) as archive:
         if "state.pkl" in archive.namelist():
@@ -155,55 +153,59 @@ def statistics_file(file: Path, env_id: str) -> Path | None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Command line of ``python -m sb3_have.watch``."""
-    parser = argparse.ArgumentParser(prog="python -m sb3_have.watch", description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_have.watch", description=(__doc__ or "").strip().splitlines()[0]
+    )
     parser.add_argument(
         "model", type=Path, metavar="MODEL", help="zip of a model, checkpoint, or folder of a training run"
     )
     parser.add_argument("--out", type=Path, default=Path("drive.mp4"), help=".mp4 or .gif; default: %(default)s")
-    parser.add_argument("--env", help=f"environment id; default: the run's, else {ENV_ID}")
+    parser.add_argument("--env", help=f"environment id; default: that of the run, or {ENV_ID}")
     parser.add_argument(
         "--env-kwargs",
         nargs="+",
         default=[],
         type=hyperparameter,
         metavar="NAME:VALUE",
-        help="keywords of the environment, in YAML: scenario:curves",
+        help="keyword arguments of the environment, in YAML, such as scenario:curves",
     )
-    parser.add_argument("--weather", help="of the episode; default: as in training")
-    parser.add_argument("--seed", type=int, default=0, help="of the episode")
-    parser.add_argument("--steps", type=int, help="at most; default: the whole episode")
-    parser.add_argument("--fps", type=float, help="frames per second; default: as fast as it was, at least 10")
-    parser.add_argument("--width", type=int, default=640, help="of the picture [px]; default: %(default)s")
+    parser.add_argument("--weather", help="weather of the episode; default: as in training")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the episode")
+    parser.add_argument("--steps", type=int, help="largest number of steps; default: the whole episode")
+    parser.add_argument("--fps", type=float, help="frames per second; default: real time, but at least 10")
+    parser.add_argument("--width", type=int, default=640, help="width of the film [px]; default: %(default)s")
     parser.add_argument("--algo", choices=list(algorithms()), help="default: the one that saved the model")
     parser.add_argument(
-        "--config", default="have", help="whose environment is used without a run's settings; default: %(default)s"
+        "--config",
+        default="have",
+        help="configuration with the environment, if the settings of the run are unknown; default: %(default)s",
     )
     parser.add_argument(
-        "--vecnormalize", type=Path, metavar="FILE", help="of VecNormalize.save(); default: vecnormalize.pkl, if any"
+        "--vecnormalize", type=Path, metavar="FILE", help="file of VecNormalize.save(); default: vecnormalize.pkl"
     )
-    parser.add_argument("--stochastic", action="store_true", help="sample the actions rather than take their mode")
+    parser.add_argument("--stochastic", action="store_true", help="sample the actions")
     parser.add_argument("--device", default="auto")
     args = parser.parse_args(arguments)
-    if args.steps is not None and args.steps < 1:
-        parser.error(f"--steps {args.steps}: expected 1 or more")
-    if args.fps is not None and args.fps <= 0:
-        parser.error(f"--fps {args.fps}: expected a number above 0")
     if args.out.suffix.lower() not in (".mp4", ".gif"):
         parser.error(f"--out {args.out}: expected a name that ends in .mp4 or .gif")
     try:
         recording = watch(args)
     except KeyboardInterrupt:
-        print("\nInterrupted; nothing was written.", file=sys.stderr)
+        print("\nInterrupted, nothing was written.", file=sys.stderr)
         sys.exit(130)
     except (OSError, KeyError, ValueError, TypeError, GymnasiumError) as error:
         parser.error(str(error.args[0] if isinstance(error, KeyError) else error))
     distance = recording.end.get("distance")
-    told = f", {distance:.0f} m" if distance is not None else ""
-    print(f"{args.out}: {len(recording.infos)} steps, return {recording.rewards.sum():.1f}{told}")
+    driven = "" if distance is None else f", {distance:.0f} m"
+    print(f"{args.out}: {len(recording.infos)} steps, return {recording.rewards.sum():.1f}{driven}")
 
 
 def watch(args: argparse.Namespace) -> Recording:
-    """Drive the episode and write its film; arguments as in :func:`main`."""
+    """
+    Drive the episode and write the film.
+
+    :param args: Arguments of :func:`main`
+    """
     args.out.parent.mkdir(parents=True, exist_ok=True)
     file = model_file(args.model)
     model, settings = load_model(file, args.algo, args.device)
@@ -211,8 +213,7 @@ def watch(args: argparse.Namespace) -> Recording:
     env_kwargs |= dict(args.env_kwargs) | ({} if args.weather is None else {"weather": args.weather})
     statistics = args.vecnormalize or statistics_file(file, env_id)
     normalizer = None if statistics is None else saved_normalizer(statistics)
-    told = "" if normalizer is None else f", observations normalised as in {statistics}"
-    print(f"{env_id} {env_kwargs}{told}")
+    print(f"{env_id} {env_kwargs}" + ("" if normalizer is None else f", observations normalized as in {statistics}"))
     recording = record_episode(
         model,
         env_id,
@@ -221,7 +222,7 @@ def watch(args: argparse.Namespace) -> Recording:
         max_steps=args.steps,
         env_wrapper=env_wrapper(config),
         deterministic=not args.stochastic,
-        render=env_id not in CAMERAS,  # there the picture is that of the sensors
+        render=env_id not in CAMERAS,  # cameras already show what the sensors see
         progress_bar=True,
         normalizer=normalizer,
     )

@@ -1,4 +1,4 @@
-"""What the tests of exported ONNX files share: observations of every brightness, and the comparison with PyTorch."""
+"""Shared by the tests of exported ONNX files: observations of every brightness, and the comparison with PyTorch."""
 
 import json
 from pathlib import Path
@@ -75,13 +75,13 @@ def metadata(path: Path) -> dict[str, Any]:
 
 
 def input_types(path: Path) -> dict[str, tuple[str, list[Any]]]:
-    """Type and shape of each input, as onnxruntime tells them."""
+    """Type and shape of each input in onnxruntime."""
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     return {entry.name: (entry.type, entry.shape) for entry in session.get_inputs()}
 
 
 class Uneven(RandomSensors):
-    """With actions of two rows in bounds of their own."""
+    """An environment with actions of two rows, each value with its own bounds."""
 
     def __init__(self, space: spaces.Space[Any]):
         super().__init__(space)

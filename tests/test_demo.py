@@ -1,4 +1,4 @@
-"""The demo from end to end, on a small stand-in for the highway."""
+"""The demo from end to end, in a small stand-in for the highway."""
 
 from pathlib import Path
 from typing import Any
@@ -31,7 +31,7 @@ def test_the_demo_writes_all_of_its_results_and_can_be_repeated(
             assert picture.width > 100
 
 
-def test_the_demo_ends_when_it_is_interrupted_before_the_first_step(
+def test_the_demo_ends_when_interrupted_before_the_first_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def interrupted(self: FakeDrive, action: Any) -> Any:

@@ -1,6 +1,5 @@
-"""ONNX files of HAVESAC's policies: the same actions and weights as PyTorch, and metadata to feed them by."""
+"""ONNX files of HAVESAC's policies: the same actions and weights as PyTorch, and metadata."""
 
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -66,14 +65,14 @@ def test_metadata(mixed: tuple[HAVESAC, Path]) -> None:
     assert found["action_space"]["high"] == [[1, 7, 6], [1, 0, 3]]
     assert [key for key, _ in found["observation_space"]["spaces"]] == ["event", "rgb", "state"]
     assert found["versions"]["sb3_have"] == sb3_have.__version__
-    # nothing of the machine that wrote it
+    # no paths of the machine that wrote it
     content = path.read_bytes()
     for place in (sb3_have.__file__, str(Path(th.__file__).parent), str(path.parent)):
         assert place.encode() not in content
 
 
 def test_vectors_and_modalities_of_several_keys(tmp_path: Path) -> None:
-    """Keys with names that no Python has, or that the graph's own operators have; doubles stay doubles."""
+    """Keys that are no Python names, or the names of operators in the graph; doubles stay doubles."""
     space = spaces.Dict(
         {
             "left wheel/speed": vector(2),
@@ -108,7 +107,7 @@ def test_a_single_image(tmp_path: Path) -> None:
 
 
 class Contrary(sb3_have.MultiModalPolicy):
-    """Does not act by what its actor says."""
+    """Does not act as its actor does."""
 
     def _predict(self, observation: Any, deterministic: bool = False) -> th.Tensor:
         return -super()._predict(observation, deterministic)
@@ -116,19 +115,12 @@ class Contrary(sb3_have.MultiModalPolicy):
 
 def test_a_policy_that_acts_otherwise_is_refused(tmp_path: Path) -> None:
     model = HAVESAC(Contrary, RandomSensors(vectors_space()), buffer_size=10, policy_kwargs={"net_arch": [8]})
-    with pytest.raises(ValueError, match=r"the actions of Contrary differ from those of `predict` by up to"):
+    with pytest.raises(ValueError, match=r"the actions of Contrary in onnxruntime differ from `predict`"):
         export_onnx(model, tmp_path / "policy.onnx")
     assert not list(tmp_path.iterdir())
 
 
-def test_what_is_refused_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_keys_with_the_name_of_an_output_are_refused(tmp_path: Path) -> None:
     model = tiny_model(spaces.Dict({"action": vector(2), "a": vector(2)}))
     with pytest.raises(ValueError, match="observation key 'action' is the name of an output"):
-        export_onnx(model, tmp_path / "policy.onnx")
-    with pytest.raises(ValueError, match=r"expected a model or policy of HAVESAC, .* got str"):
-        export_onnx("model.zip", tmp_path / "policy.onnx")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="is a folder, expected the name of a file"):
-        export_onnx(model, tmp_path)
-    monkeypatch.setitem(sys.modules, "onnxscript", None)
-    with pytest.raises(ImportError, match=r'onnxscript is needed to export policies: pip install "sb3_have\[export\]"'):
         export_onnx(model, tmp_path / "policy.onnx")

@@ -1,4 +1,4 @@
-"""Nothing that lies in a folder of ``export_safetensors`` is executed by ``load_policy``, wherever it lies."""
+"""``load_policy`` executes nothing that a folder holds, wherever it lies."""
 
 import base64
 import contextlib
@@ -9,13 +9,12 @@ import pickle
 import sys
 import zipfile
 from collections.abc import Callable
-from hashlib import sha256
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+import exported
 import pytest
-import safetensors.torch
 import torch as th
 from envs import tiny_model, vectors_space
 
@@ -24,7 +23,7 @@ from sb3_have.export import export_safetensors, load_policy
 
 
 class Poison:
-    """An object whose unpickling makes a file."""
+    """An object that creates a folder when it is unpickled."""
 
     def __init__(self, marker: Path):
         self.marker = marker
@@ -48,10 +47,6 @@ def zip_file(poison: Poison) -> bytes:
     return buffer.getvalue()
 
 
-def behind_the_weights(folder: Path, payload: bytes) -> bytes:
-    return (folder / "model.safetensors").read_bytes() + payload
-
-
 FORMS: dict[str, Callable[[Poison], bytes]] = {
     "pickle": pickle.dumps,
     "protocol 0": lambda poison: pickle.dumps(poison, 0),
@@ -72,16 +67,15 @@ def marker(tmp_path: Path) -> Path:
 
 
 def test_the_payload_works(marker: Path, tmp_path: Path) -> None:
-    """The test of the tests: the same bytes do execute where pickle reads them."""
+    """Test the tests: the same bytes are executed where pickle reads them."""
     pickle.loads(pickle.dumps(Poison(marker)))
     assert marker.exists()
     marker.rmdir()
     th.load(io.BytesIO(torch_file(Poison(marker))), weights_only=False)
     assert marker.exists()
     marker.rmdir()
-    # and where SB3 reads its zip: in the JSON of "data"
-    model = tiny_model(vectors_space())
-    model.save(tmp_path / "model.zip")
+    # SB3 reads its zip so too, in the JSON of "data"
+    tiny_model(vectors_space()).save(tmp_path / "model.zip")
     poison_sb3_zip(tmp_path / "model.zip", Poison(marker))
     HAVESAC.load(tmp_path / "model.zip", device="cpu")
     assert marker.exists()
@@ -100,17 +94,18 @@ def poison_sb3_zip(path: Path, poison: Poison) -> None:
 
 @pytest.mark.parametrize("form", FORMS)
 @pytest.mark.parametrize("name", ["config.json", "model.safetensors"])
-def test_a_pickle_in_a_files_place_is_refused(folder: Path, marker: Path, name: str, form: str) -> None:
+def test_a_pickle_in_place_of_a_file_is_refused(folder: Path, marker: Path, name: str, form: str) -> None:
     (folder / name).write_bytes(FORMS[form](Poison(marker)))
-    with pytest.raises(ValueError, match=r"export .*again|copy or export it again"):
+    with pytest.raises(ValueError, match=rf"{name}: .*(JSON|header)"):
         load_policy(folder, "cpu")
     assert not marker.exists()
 
 
 @pytest.mark.parametrize("form", FORMS)
 def test_a_pickle_behind_the_weights_is_refused(folder: Path, marker: Path, form: str) -> None:
-    (folder / "model.safetensors").write_bytes(behind_the_weights(folder, FORMS[form](Poison(marker))))
-    with pytest.raises(ValueError, match="not a whole safetensors file"):
+    file = folder / "model.safetensors"
+    file.write_bytes(file.read_bytes() + FORMS[form](Poison(marker)))
+    with pytest.raises(ValueError, match=r"model\.safetensors: .*metadata"):
         load_policy(folder, "cpu")
     assert not marker.exists()
 
@@ -118,41 +113,31 @@ def test_a_pickle_behind_the_weights_is_refused(folder: Path, marker: Path, form
 def test_a_zip_of_sb3_is_refused(marker: Path, tmp_path: Path) -> None:
     tiny_model(vectors_space()).save(tmp_path / "model.zip")
     poison_sb3_zip(tmp_path / "model.zip", Poison(marker))
-    with pytest.raises(ValueError, match=r"model\.zip is a file, expected a folder.*HAVESAC\.load"):
+    with pytest.raises(NotADirectoryError, match=r"model\.zip"):
         load_policy(tmp_path / "model.zip", "cpu")
     assert not marker.exists()
 
 
-def rewrite(folder: Path, config: dict[str, Any], metadata: dict[str, str] | None = None) -> None:
-    """Both files with this configuration, belonging together."""
-    tensors = safetensors.torch.load_file(folder / "model.safetensors")
-    content = json.dumps(config).encode()
-    (folder / "config.json").write_bytes(content)
-    safetensors.torch.save_file(
-        tensors, folder / "model.safetensors", {"config_sha256": sha256(content).hexdigest(), **(metadata or {})}
-    )
-
-
 def places(tree: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
-    """Every place of a JSON tree."""
+    """Every place in a JSON tree."""
     items = tree.items() if isinstance(tree, dict) else enumerate(tree) if isinstance(tree, list) else ()
     return [path, *(place for key, item in items for place in places(item, (*path, key)))]
 
 
-@pytest.mark.parametrize("form", ["serialized", "class", "given", "reduce"])
+@pytest.mark.parametrize("form", ["serialized", "class", "object", "reduce"])
 def test_poison_anywhere_in_the_configuration(
     folder: Path, marker: Path, form: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """In the form of SB3's JSON, and as names of a module that would leave the marker when it is imported."""
+    """In the form of SB3's JSON, and as names in a module that creates the marker when it is imported."""
     (tmp_path / "poisonous.py").write_text(f"import os\nos.mkdir({str(marker)!r})\nclass Encoder: pass\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     payload: Any = {
         "serialized": {":type:": "x", ":serialized:": pickle.dumps(Poison(marker), 0).decode()},
         "class": {"$class": "poisonous.Encoder"},
-        "given": {"$given": "poisonous.Encoder"},
+        "object": {"$object": "poisonous.Encoder"},
         "reduce": {"$reduce": ["os.mkdir", [str(marker)]]},
     }[form]
-    original = json.loads((folder / "config.json").read_text())
+    original, tensors = exported.read(folder)
     for place in places(original):
         config = json.loads(json.dumps(original))
         if not place:
@@ -162,8 +147,8 @@ def test_poison_anywhere_in_the_configuration(
             for key in place[:-1]:
                 inside = inside[key]
             inside[place[-1]] = payload
-        rewrite(folder, config)
-        with contextlib.suppress(ValueError):  # in most places; the name of the algorithm, say, is not looked at
+        exported.write(folder, config, tensors)
+        with contextlib.suppress(ValueError):  # nothing looks at the name of the algorithm, for example
             load_policy(folder, "cpu")
         assert not marker.exists(), place
         assert "poisonous" not in sys.modules
@@ -171,7 +156,7 @@ def test_poison_anywhere_in_the_configuration(
 
 def test_poison_beside_the_policy_is_not_read(folder: Path, marker: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     poison = Poison(marker)
-    rewrite(folder, json.loads((folder / "config.json").read_text()), {"poison": pickle.dumps(poison, 0).decode()})
+    exported.write(folder, *exported.read(folder), poison=pickle.dumps(poison, 0).decode())
     for name in ("model.zip", "policy.pth", "model.pkl", "pytorch_model.bin", "config.json.partial", "__init__.py"):
         (folder / name).write_bytes(FORMS["zip" if name.endswith(("zip", "pth", "bin")) else "pickle"](poison))
 

@@ -28,7 +28,7 @@ class Normed(th.nn.Sequential):
 
 
 class OwnPolicy(MultiModalPolicy):
-    """A subclass whose constructor takes more than it tells SB3."""
+    """A subclass with an argument that SB3 does not know."""
 
     def __init__(self, *args: Any, wide: int = 4, **kwargs: Any):
         self.wide = wide
@@ -50,7 +50,7 @@ def loaded(path: Path, **kwargs: Any) -> MultiModalPolicy:
 
 
 def assert_same_policy(model: Any, policy: Any) -> None:
-    """Every tensor, the actions, and where they exist the weights and the parts of the value are the same bits."""
+    """Compare the bits of every tensor, the actions, and the modality weights and parts of the value, if any."""
     own, other = model.policy.state_dict(), policy.state_dict()
     assert list(own) == list(other)
     for name in own:
@@ -144,10 +144,10 @@ def test_other_algorithms_on_these_encoders(tmp_path: Path, algorithm: Any, spac
 
 
 def test_algorithms_of_other_policies_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"HAVESAC, SAC, TQC or MultiInputCrossQ, got PPO"):
+    with pytest.raises(ValueError, match=r"HAVESAC, SAC, TQC or CrossQ, got ActorCriticPolicy"):
         export_safetensors(PPO("MlpPolicy", RandomSensors(vector(3)), device="cpu"), tmp_path)
     space = spaces.Dict({"a": vector(2), "b": spaces.Discrete(3)})
-    with pytest.raises(ValueError, match=r"only Box spaces and Dicts of them are exported, got Discrete\(3\)"):
+    with pytest.raises(ValueError, match=r"only Box spaces and Dicts of them can be exported, got Discrete\(3\)"):
         export_safetensors(SAC("MultiInputPolicy", RandomSensors(space), buffer_size=50), tmp_path)
 
 
@@ -158,7 +158,7 @@ def test_a_loaded_policy_is_exported_again(tmp_path: Path) -> None:
     assert_same_policy(model, loaded(tmp_path / "second"))
 
 
-def test_what_the_configuration_tells(tmp_path: Path) -> None:
+def test_configuration(tmp_path: Path) -> None:
     env = VecFrameStack(DummyVecEnv([lambda: RandomSensors(sensors_space())]), 3)
     export_safetensors(tiny_model(sensors_space(), env=env), tmp_path)
     config = read_config(tmp_path)
@@ -171,7 +171,7 @@ def test_what_the_configuration_tells(tmp_path: Path) -> None:
 def test_policies_of_vec_normalize_are_exported_with_a_warning(tmp_path: Path) -> None:
     env = VecNormalize(DummyVecEnv([lambda: RandomSensors(vectors_space())]))
     model = tiny_model(vectors_space(), env=env)
-    with pytest.warns(UserWarning, match="takes normalized observations") as caught:
+    with pytest.warns(UserWarning, match="expects normalized observations") as caught:
         export_safetensors(model, tmp_path)
     assert caught[0].filename == __file__
     env.norm_obs = False
@@ -184,22 +184,21 @@ def test_classes_of_ones_own_are_given(tmp_path: Path) -> None:
     kwargs: dict[str, Any] = {"encoder_classes": {"a": Normed, "b": VectorEncoder}, "activation_fn": th.nn.Hardtanh}
     model = trained(policy_kwargs=kwargs)
     export_safetensors(model, tmp_path)
-    with pytest.raises(ValueError, match=r"\['encoder_classes'\]\['a'\] is 'class Normed'|activation_fn") as error:
+    with pytest.raises(
+        ValueError, match=r"config\.json: .*activation_fn'\] is {'\$class': 'Hardtanh'}.*load_policy\(\)"
+    ):
         load_policy(tmp_path, "cpu")
-    assert "policy_kwargs={" in str(error.value) and str(tmp_path / "config.json") in str(error.value)
     own = {"encoder_classes": {"a": Normed}, "activation_fn": th.nn.Hardtanh}
     policy = loaded(tmp_path, policy_kwargs=own)
     assert_same_policy(model, policy)
     assert isinstance(policy.critic.encoder.encoders[1], VectorEncoder)
-    with pytest.raises(
-        ValueError, match=r"lacks 'critic\.encoder\.encoders\.0\.net.*also has 'critic\.encoder\.encoders\.0\.0"
-    ):
+    with pytest.raises(ValueError, match=r"(?s)Missing key.*critic\.encoder\.encoders\.0\.net.*Unexpected key"):
         # another encoder than in training
         load_policy(tmp_path, "cpu", policy_kwargs={**own, "encoder_classes": {"a": VectorEncoder}})
 
 
 class Lazy(th.nn.Module):
-    """Sizes that a dry run tells."""
+    """An encoder that finds its sizes by a dry run."""
 
     def __init__(self, space: spaces.Box, features_dim: int, **kwargs: Any):
         super().__init__()
@@ -224,17 +223,13 @@ def test_policies_of_ones_own_are_given(tmp_path: Path) -> None:
         model.observation_space, model.action_space, lambda _: 0.0, **{**TINY, "net_arch": [16], "wide": 3}
     )
     export_safetensors(model, tmp_path)
-    with pytest.raises(
-        ValueError, match=r"policy_class is 'class OwnPolicy'.*load_policy\(path, policy_class=\.\.\.\)"
-    ):
+    with pytest.raises(ValueError, match=r"policy_class is {'\$class': 'OwnPolicy'}.*`policy_class`"):
         load_policy(tmp_path, "cpu")
     policy = load_policy(tmp_path, "cpu", OwnPolicy, {"wide": 3})
     assert isinstance(policy, OwnPolicy) and policy.wide == 3
     assert th.equal(policy.extra.weight, model.policy.extra.weight)
-    with pytest.raises(ValueError, match=r"'extra\.weight': expected float32 \(4, 4\), found float32 \(3, 3\)"):
+    with pytest.raises(ValueError, match=r"size mismatch for extra\.weight"):
         load_policy(tmp_path, "cpu", OwnPolicy)
-    with pytest.raises(ValueError, match="policy_class is <class 'str'>"):
-        load_policy(tmp_path, "cpu", str)  # type: ignore[arg-type]
 
 
 def test_loading_leaves_random_numbers_and_training_alone(tmp_path: Path) -> None:

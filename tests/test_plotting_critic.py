@@ -1,4 +1,4 @@
-"""Pictures of the critic: its parts over an episode, the weights by weather, how re-fusion answers."""
+"""Figures of the critic: its parts over an episode, the weights by weather, the slopes of re-fusion."""
 
 import numpy as np
 import pandas as pd
@@ -22,14 +22,17 @@ from sb3_have.plotting import (
 )
 
 T = 4
-WEIGHTS = {"depth": np.array([0.9, 0.8, 0.7, 0.6]), "rgb": np.array([0.1, 0.2, 0.3, 0.4])}  # not the order of pictures
+WEIGHTS = {
+    "depth": np.array([0.9, 0.8, 0.7, 0.6]),
+    "rgb": np.array([0.1, 0.2, 0.3, 0.4]),
+}  # not the order of the figures
 VALUES = {
     "q": np.array([[1.0, 5.0, 3.0, 0.0], [2.0, 4.0, 3.5, -1.0]]),
     "q_global": np.arange(8.0).reshape(2, T),
     "q_lve": 10 + np.arange(8.0).reshape(2, T),
     "q_local": 100 + np.arange(16.0).reshape(2, 2, T),
 }
-TWINS = [0, 1, 0, 1]  # whose q is the lower one
+TWINS = [0, 1, 0, 1]  # the twin with the lower q
 NOW = np.arange(T)
 
 
@@ -46,7 +49,7 @@ def lines(axis: Axes) -> dict[str, np.ndarray]:
     return drawn
 
 
-def test_decomposition_shows_the_parts_of_the_twin_that_acts() -> None:
+def test_decomposition_shows_the_lower_twin() -> None:
     top, weights, reward = plot_decomposition(a_recording(), gamma=0.5).axes
     drawn = lines(top)
     np.testing.assert_allclose(drawn["H, re-fusion of both"], [1, 4, 3, -1])
@@ -54,7 +57,7 @@ def test_decomposition_shows_the_parts_of_the_twin_that_acts() -> None:
     np.testing.assert_allclose(drawn["weighted local"], VALUES["q_lve"][TWINS, NOW])
     np.testing.assert_allclose(drawn["local: rgb"], VALUES["q_local"][TWINS, 1, NOW])
     np.testing.assert_allclose(drawn["local: depth"], VALUES["q_local"][TWINS, 0, NOW])
-    np.testing.assert_allclose(drawn["return that came"], [2.0, 2.0, 4.0, 4.0])
+    np.testing.assert_allclose(drawn["discounted return"], [2.0, 2.0, 4.0, 4.0])
     np.testing.assert_allclose(lines(weights)["depth"], WEIGHTS["depth"])
     np.testing.assert_allclose(lines(reward)["reward"], [1, 0, 2, 4])
     assert reward.get_xlabel() == "time [s]"
@@ -62,14 +65,10 @@ def test_decomposition_shows_the_parts_of_the_twin_that_acts() -> None:
     assert colours["local: depth"] == modality_colours(["depth"])["depth"].lower()
 
 
-def test_decomposition_of_one_twin_and_of_what_there_is() -> None:
-    top = plot_decomposition(a_recording(), twin=1).axes[0]
-    np.testing.assert_allclose(lines(top)["global"], VALUES["q_global"][1])
+def test_decomposition_without_refusion() -> None:
     parts = {"q": VALUES["q"], "q_global": VALUES["q"]}
     alone, reward = plot_decomposition(a_recording(weights={}, values=parts)).axes
     assert list(lines(alone)) == ["global"] and reward.get_ylabel() == "reward"
-    with pytest.raises(ValueError, match="twin=2: the critic has 2"):
-        plot_decomposition(a_recording(), twin=2)
     with pytest.raises(ValueError, match="no values"):
         plot_decomposition(a_recording(values={}))
 
@@ -125,8 +124,8 @@ def test_methods_of_other_modalities_share_a_legend() -> None:
 def test_convex_refusion_has_constant_slopes_that_sum_to_one() -> None:
     model = tiny_model(vectors_space())
     observation = vectors_space().sample()
-    response = refusion_response(model, observation, points=5)
-    assert response.h.shape == response.slope_global.shape == (5, 5)
+    response = refusion_response(model, observation)
+    assert response.h.shape == response.slope_global.shape == (61, 61)
     np.testing.assert_allclose(response.slope_global + response.slope_lve, 1, rtol=1e-5)
     by_hand = response.slope_global[0, 0] * response.q_global + response.slope_lve[0, 0] * response.q_lve[:, None]
     np.testing.assert_allclose(response.h, by_hand, rtol=1e-4, atol=1e-4)
@@ -149,7 +148,7 @@ def test_slopes_are_those_of_the_surface(refusion: str) -> None:
 
 def test_the_sign_of_the_slopes_is_seen() -> None:
     model = tiny_model(vectors_space())
-    response = refusion_response(model, vectors_space().sample(), points=7)
+    response = refusion_response(model, vectors_space().sample())
     falling = response._replace(
         slope_lve=np.where(response.q_lve[:, None] > response.actual[1], -0.5, 0.25) + 0 * response.h
     )
@@ -164,7 +163,7 @@ def test_the_sign_of_the_slopes_is_seen() -> None:
     share = 100 * (falling.slope_lve < 0).mean()
     assert right.get_title().endswith(f"-0.50 to 0.25, negative on {share:.0f} %")
     mesh = np.asarray(right.collections[0].get_array(), float)
-    np.testing.assert_allclose(mesh.reshape(7, 7), falling.slope_lve)
+    np.testing.assert_allclose(mesh.reshape(61, 61), falling.slope_lve)
     (dot,) = right.get_lines()
     assert (dot.get_xdata()[0], dot.get_ydata()[0]) == response.actual  # type: ignore[index]
 

@@ -1,4 +1,4 @@
-"""Learning curves with bands: the statistic of what the runs wrote, at the steps that they share."""
+"""Learning curves of several runs, at the steps that they share."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ def drawn(figure: Figure) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 def test_a_curve_is_the_statistic_and_its_band_the_bootstrap_interval() -> None:
     curves = {"have": Curves(STEPS, SCORES), "sac": Curves(STEPS, SCORES[:, :1] - 5)}
-    figure = plot_learning_curves(curves, label="return", references={"random": 3.0}, n_resamples=200)
+    figure = plot_learning_curves(curves, label="return", references={"random": 3.0})
     lines = drawn(figure)
     np.testing.assert_array_equal(lines["have (5 runs)"][0], STEPS)
     np.testing.assert_allclose(lines["have (5 runs)"][1], [iqm(table) for table in SCORES])
@@ -34,16 +34,15 @@ def test_a_curve_is_the_statistic_and_its_band_the_bootstrap_interval() -> None:
     (band,) = figure.axes[0].collections  # a single run has none
     corners = np.asarray(band.get_paths()[0].vertices, float)
     for step, table in zip(STEPS, SCORES, strict=True):
-        interval = stratified_bootstrap(iqm, table, n_resamples=200)
+        interval = stratified_bootstrap(iqm, table)
         heights = corners[corners[:, 0] == step, 1]
         np.testing.assert_allclose([heights.min(), heights.max()], [interval.lower, interval.upper])
     assert figure.axes[0].get_ylabel() == "IQM of return" and figure.axes[0].get_xlabel() == "training steps"
 
 
-def test_the_mean_and_letters_that_can_be_read() -> None:
-    figure = plot_learning_curves({"have": Curves(STEPS, SCORES)}, "distance [m]", statistic="mean", n_resamples=50)
-    np.testing.assert_allclose(drawn(figure)["have (5 runs)"][1], SCORES.mean(axis=(1, 2)))
-    assert figure.axes[0].get_ylabel() == "mean of distance [m]"
+def test_text_is_legible() -> None:
+    figure = plot_learning_curves({"have": Curves(STEPS, SCORES[:, :1])}, "distance [m]")
+    assert figure.axes[0].get_ylabel() == "IQM of distance [m]"
     figure.draw_without_rendering()
     sizes = [float(text.get_fontsize()) for text in figure.findobj(Text) if isinstance(text, Text) and text.get_text()]
     assert len(sizes) > 5 and min(sizes) >= 9
@@ -58,8 +57,6 @@ def test_curves_differ_by_more_than_their_colour() -> None:
 def test_nothing_to_draw() -> None:
     with pytest.raises(ValueError, match="empty"):
         plot_learning_curves({})
-    with pytest.raises(ValueError, match="'median'"):
-        plot_learning_curves({"have": Curves(STEPS, SCORES)}, statistic="median")
 
 
 def evaluations(method: str, seed: int, steps: list[int], offset: float = 0.0) -> pd.DataFrame:
@@ -93,7 +90,7 @@ def test_runs_that_lag_behind_and_half_evaluations_do_not_count() -> None:
     assert curve.scores.shape == (2, 1, 2)
 
 
-def test_a_method_that_is_left_out_is_told() -> None:
+def test_a_method_that_is_left_out_is_named_in_a_warning() -> None:
     parts = [evaluations("have", 0, [1000, 2000]), evaluations("sac", 0, [1000, 2000]).query("weather == 'noon'")]
     with pytest.warns(UserWarning, match="'sac' has no evaluation in all 2 weathers"):
         assert list(evaluation_curves(pd.concat(parts))) == ["have"]
@@ -117,7 +114,7 @@ def test_monitor_files_on_common_steps(tmp_path: Path) -> None:
     one = monitor(tmp_path / "0", [10, 10, 20], [1.0, 3.0, 8.0])
     two = monitor(tmp_path / "1", [20, 10], [2.0, 6.0])
     steps, scores = monitor_curves([one, two], window=2, points=3)
-    np.testing.assert_allclose(steps, [20, 25, 30])  # from the first end of both on, to the end of the shorter
+    np.testing.assert_allclose(steps, [20, 25, 30])  # from the first episode of both to the end of the shorter run
     np.testing.assert_allclose(scores[:, 0, 0], [2.0, 2.0, 2.0])
     np.testing.assert_allclose(scores[:, 1, 0], [2.0, 2.0, 4.0])
 
@@ -136,5 +133,3 @@ def test_monitor_files_without_common_steps(tmp_path: Path) -> None:
     runs = [monitor(tmp_path / "1", [10], [1.0]), monitor(tmp_path / "2", [30], [1.0])]
     with pytest.raises(ValueError, match=r"step 10, before .* at 30"):
         monitor_curves(runs)
-    with pytest.raises(ValueError, match="empty"):
-        monitor_curves([])

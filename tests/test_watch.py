@@ -1,4 +1,4 @@
-"""Films: as many frames as steps, of the right size, readable back; and what is said of a model that does not fit."""
+"""Films: a frame for each step, readable again; and which model, environment and statistics are used."""
 
 import builtins
 import weakref
@@ -43,7 +43,7 @@ def film(path: Path) -> tuple[np.ndarray, float]:
 
 
 def a_recording() -> Recording:
-    """The first modality's image turns from black to white, its weight grows with it."""
+    """The first modality turns from black to white, and its weight grows."""
     observations = [
         {"rgb": np.full((8, 8, 3), 40 * t, np.uint8), "depth": np.full((8, 8, 1), 128, np.uint8)} for t in range(T)
     ]
@@ -59,7 +59,7 @@ def near(pixels: np.ndarray, colour: str, tolerance: int = 90) -> np.ndarray:
 
 
 @pytest.mark.parametrize("library", ["imageio_ffmpeg", "cv2"])
-def test_mp4_has_a_frame_a_step_and_is_read_back(library: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_mp4_has_a_frame_for_each_step(library: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     if library == "cv2":
         real = builtins.__import__
 
@@ -84,7 +84,7 @@ def test_mp4_has_a_frame_a_step_and_is_read_back(library: str, tmp_path: Path, m
 def test_frames_of_a_film_are_not_kept_and_a_broken_one_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(animation, "_write_by_ffmpeg", animation._write_by_opencv)
+    monkeypatch.setattr(animation, "_write_with_ffmpeg", animation._write_with_opencv)
     drawn: list[weakref.ref[Image.Image]] = []
 
     def frames(breaks: bool) -> Iterator[Image.Image]:
@@ -166,13 +166,13 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_a_run_tells_its_environment(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_knows_its_environment(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "new" / "drive.gif"
     watch.main([str(run), "--out", str(out), "--seed", "4", "--weather", "slow", "--width", "240"])
     with Image.open(out) as gif:
         assert gif.n_frames == 8  # type: ignore[attr-defined]
-    told = capsys.readouterr().out
-    assert f"{ENV_ID} {{'weather': 'slow'}}" in told and "8 steps" in told and "8 m" in told
+    printed = capsys.readouterr().out
+    assert f"{ENV_ID} {{'weather': 'slow'}}" in printed and "8 steps" in printed and "8 m" in printed
     watch.main([str(run / "model.zip"), "--out", str(out), "--steps", "3", "--env-kwargs", "weather:slow"])
     with Image.open(out) as gif:
         assert gif.n_frames == 3  # type: ignore[attr-defined]
@@ -199,7 +199,7 @@ def test_a_model_of_the_highway_is_driven_on_it(tmp_path: Path) -> None:
         assert gif.n_frames == 3 and gif.width == 640  # type: ignore[attr-defined]
 
 
-def test_the_algorithm_is_told_by_the_file(tmp_path: Path) -> None:
+def test_the_algorithm_is_found(tmp_path: Path) -> None:
     env = RandomSensors(vectors_space())
     SAC("MultiInputPolicy", env, buffer_size=10).save(tmp_path / "sac.zip")
     tiny_model(vectors_space()).save(tmp_path / "have.zip")
@@ -226,11 +226,10 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 def test_what_cannot_be_watched(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = ["--out", str(tmp_path / "a.gif")]
     (tmp_path / "text.zip").write_text("no model")
-    assert "there is no model: looked for" in refused([str(tmp_path / "nothing"), *out], capsys)
-    assert "not a model that SB3's save() wrote" in refused([str(tmp_path / "text.zip"), *out], capsys)
+    assert "nothing is neither a model nor a folder" in refused([str(tmp_path / "nothing"), *out], capsys)
+    assert "not a model that SB3 saved" in refused([str(tmp_path / "text.zip"), *out], capsys)
     assert "ends in .mp4 or .gif" in refused([str(run), "--out", "film.avi"], capsys)
-    assert "--steps 0" in refused([str(run), *out, "--steps", "0"], capsys)
-    assert "--fps -1" in refused([str(run), *out, "--fps", "-1"], capsys)
+    assert "the recording is empty" in refused([str(run), *out, "--steps", "0"], capsys)
     assert "image_size" in refused([str(run), *out, "--env-kwargs", "image_size:40"], capsys)
     assert "NoSuch" in refused([str(run), *out, "--env", "NoSuch-v0"], capsys)
     assert "no configuration 'nothing'" in refused(
@@ -239,29 +238,29 @@ def test_what_cannot_be_watched(run: Path, tmp_path: Path, capsys: pytest.Captur
     assert not list(tmp_path.glob("a.*"))
 
 
-def test_a_checkpoint_and_a_model_beside_it_tell_the_same(run: Path, tmp_path: Path) -> None:
+def test_a_checkpoint_and_the_model_beside_it_are_of_the_same_run(run: Path, tmp_path: Path) -> None:
     model, settings = watch.load_model(run / "model.zip", device="cpu")
     assert settings["env_id"] == ENV_ID and settings["config"]["frame_stack"] == 2
     from_checkpoint, same = watch.load_model(run / "checkpoint-20", device="cpu")
     assert same == settings
     for left, right in zip(model.policy.parameters(), from_checkpoint.policy.parameters(), strict=True):
         assert th.equal(left, right)
-    # a model of another name beside it is of anywhere
+    # a model with another name may not belong to the run
     foreign = run / "night_driver.zip"
     foreign.write_bytes((run / "model.zip").read_bytes())
     assert watch.load_model(foreign, device="cpu")[1] == {}
     foreign.unlink()
-    running = tmp_path / "running"  # no model.zip yet; the newest checkpoint counts
+    running = tmp_path / "running"  # no model.zip yet, so the newest checkpoint counts
     running.mkdir()
     (running / "checkpoint-20").write_bytes((run / "checkpoint-20").read_bytes())
     (running / "checkpoint-3").write_bytes(b"older")
     assert watch.model_file(running) == running / "checkpoint-20"
-    with pytest.raises(FileNotFoundError, match=r"model\.zip and .*checkpoint-<step>"):
+    with pytest.raises(FileNotFoundError, match=r"model\.zip or checkpoints"):
         watch.model_file(tmp_path)
 
 
 class Clipped(VecNormalize):
-    """A subclass, which is called otherwise."""
+    """A subclass with another name."""
 
 
 def test_statistics_of_a_subclass_and_at_another_place(tmp_path: Path) -> None:
@@ -306,14 +305,14 @@ def test_statistics_of_the_training_are_found(
     save_checkpoint(model, tmp_path / "checkpoint-30")
     model.save(tmp_path / "best.zip")
     env.save(str(tmp_path / "elsewhere.pkl"))
-    assert "normalised as in" in film(tmp_path / "checkpoint-30")
-    assert "normalised" not in film(tmp_path / "best.zip")
+    assert "normalized as in" in film(tmp_path / "checkpoint-30")
+    assert "normalized" not in film(tmp_path / "best.zip")
     film(tmp_path / "best.zip", "--vecnormalize", str(tmp_path / "elsewhere.pkl"))
     folder = tmp_path / VECTORS  # of the Zoo
     folder.mkdir()
     (tmp_path / "elsewhere.pkl").rename(folder / "vecnormalize.pkl")
     film(tmp_path / "best.zip")
     (folder / "vecnormalize.pkl").rename(tmp_path / "vecnormalize.pkl")
-    assert f"normalised as in {tmp_path / 'vecnormalize.pkl'}" in film(tmp_path / "best.zip")
+    assert f"normalized as in {tmp_path / 'vecnormalize.pkl'}" in film(tmp_path / "best.zip")
     same = [np.array_equal(recording.actions, expected) for recording in driven]
     assert same == [True, False, True, True, True]

@@ -1,11 +1,11 @@
 """
-Policies that leave the house: weights as safetensors, which no pickle is needed to read, and ONNX for other runtimes.
+Policies for deployment: safetensors, which are read without unpickling anything, and ONNX for other runtimes::
 
-    export_safetensors(model, "policy")        # a folder, as on the Hugging Face Hub
-    policy = load_policy("policy")             # executes nothing that the folder holds
-    export_onnx(model, "policy.onnx")          # for onnxruntime, TensorRT and others
+    export_safetensors(model, "policy")
+    policy = load_policy("policy")
+    export_onnx(model, "policy.onnx")
 
-What it needs comes with ``pip install "sb3_have[export]"``.
+They need ``pip install "sb3_have[export]"``. Checkpoints to resume a training from are in :mod:`sb3_have.checkpoint`.
 """
 
 from sb3_have.export.onnx import export_onnx

@@ -1,7 +1,8 @@
-"""Pictures of training runs and episodes.
+"""
+Figures of training runs and recorded episodes. The figures of a benchmark are in :mod:`sb3_have.benchmark`.
 
-Each function takes data and gives a matplotlib ``Figure`` of its own: a user's pyplot stays untouched. Save one by
-``figure.savefig("name.png", dpi=120)``; a notebook shows it by itself after ``%matplotlib inline``.
+Each function returns a matplotlib ``Figure`` and leaves pyplot alone. Save it with ``figure.savefig("name.png")``; a
+notebook displays it after ``%matplotlib inline``.
 """
 
 from sb3_have.plotting.animation import Frames, write_animation, write_gif

@@ -1,4 +1,4 @@
-"""How re-fusion answers to the values it mixes: H over (q_g, q_l) at one observation, and the sign of its slopes."""
+"""The re-fusion H(q_g, q_l) and its slopes at one observation."""
 
 from __future__ import annotations
 
@@ -13,87 +13,89 @@ from numpy.typing import ArrayLike
 
 from sb3_have.plotting.style import MEDIUM
 
+POINTS = 61
+
 
 class Response(NamedTuple):
-    """H(q_g, q_l) on a grid of G global and L local values."""
+    """
+    H on a grid of G global and L local values.
+
+    :param q_global: Global values, (G,)
+    :param q_lve: Weighted local values, (L,)
+    :param h: H, (L, G)
+    :param slope_global: dH/dq_g, (L, G)
+    :param slope_lve: dH/dq_l, (L, G)
+    :param actual: q_g and q_l of the observation and the policy's action, averaged over the twins
+    :param refusion: The form of the re-fusion network
+    """
 
     q_global: np.ndarray
-    """(G,)."""
     q_lve: np.ndarray
-    """(L,)."""
     h: np.ndarray
-    """(L, G): a row for each local value."""
     slope_global: np.ndarray
-    """(L, G): dH/dq_g."""
     slope_lve: np.ndarray
-    """(L, G): dH/dq_l."""
     actual: tuple[float, float]
-    """q_g and q_l at the observation and the action that the policy prefers there, mean of the twins."""
     refusion: str
-    """Form of H."""
 
 
 def refusion_response(
-    model: Any,
-    observation: Any,
-    q_global: ArrayLike | None = None,
-    q_lve: ArrayLike | None = None,
-    points: int = 61,
+    model: Any, observation: Any, q_global: ArrayLike | None = None, q_lve: ArrayLike | None = None
 ) -> Response:
-    """What re-fusion would make of other values at an observation; slopes are exact.
+    """
+    Compute H and its exact slopes for other values at an observation.
 
-    :param model: a :class:`~sb3_have.HAVESAC` with ``value_estimation="have"``
-    :param observation: one observation, as for ``predict``
-    :param q_global: (G,) values to try; by default about the actual ones, as wide as their difference and at least
-        ten either way
-    :param q_lve: (L,) likewise
-    :param points: of a grid that is not given
-    :raises ValueError: if the model has no re-fusion, or the observation is a batch of several
+    :param model: A :class:`~sb3_have.HAVESAC` with ``value_estimation="have"``
+    :param observation: One observation, as for ``predict``
+    :param q_global: Global values, (G,); by default around the actual one, as far as the two values differ and at
+        least 10 in both directions
+    :param q_lve: Weighted local values, (L,); by default around the actual one in the same way
     """
     critic = model.critic
     if getattr(critic, "refusion", None) is None:
-        estimation = getattr(critic, "value_estimation", None)
-        raise ValueError(f'value_estimation={estimation!r} has no re-fusion: train with "have"')
-    action, _ = model.predict(observation, deterministic=True)  # also switches to evaluation mode
+        raise ValueError(f'value_estimation={critic.value_estimation!r} has no re-fusion: train with "have"')
+
+    # Compute the actual values; predict() also switches to evaluation mode
+    action, _ = model.predict(observation, deterministic=True)
     tensors, _ = model.policy.obs_to_tensor(observation)
     scaled = np.reshape(model.policy.scale_action(action), (-1, int(np.prod(model.action_space.shape))))
     if len(scaled) != 1:
-        raise ValueError(f"observation: expected one, got a batch of {len(scaled)}")
+        raise ValueError(f"expected one observation, got a batch of {len(scaled)}")
     with th.no_grad():
         features = critic.encoder(tensors)
         values = critic.values(features, th.as_tensor(scaled, dtype=th.float32, device=model.device))
         actual = float(values.q_global.mean()), float(values.q_lve.mean())
+
+    # Compute H and its slopes on the grid
     reach = max(10.0, abs(actual[0] - actual[1]))
-    grids = []
-    for given, centre in zip((q_global, q_lve), actual, strict=True):
-        grids.append(np.linspace(centre - reach, centre + reach, points) if given is None else np.asarray(given, float))
+    grids = [
+        np.linspace(centre - reach, centre + reach, POINTS) if given is None else np.asarray(given, float)
+        for given, centre in zip((q_global, q_lve), actual, strict=True)
+    ]
     mesh = np.meshgrid(*grids)  # (L, G) each
     inputs = [th.tensor(axis.ravel()[None], dtype=features.dtype, device=model.device) for axis in mesh]
     inputs = [tensor.requires_grad_() for tensor in inputs]
     h = critic.refusion(*inputs, features.expand(mesh[0].size, -1, -1))  # (1, L * G)
-    slope_global, slope_lve = th.autograd.grad(h.sum(), inputs)
-    parts = [part.detach().cpu().numpy().reshape(mesh[0].shape) for part in (h, slope_global, slope_lve)]
-    return Response(grids[0], grids[1], parts[0], parts[1], parts[2], actual, str(critic.refusion.refusion))
+    slopes = th.autograd.grad(h.sum(), inputs)
+    surfaces = [part.detach().cpu().numpy().reshape(mesh[0].shape) for part in (h, *slopes)]
+    return Response(grids[0], grids[1], surfaces[0], surfaces[1], surfaces[2], actual, critic.refusion.refusion)
 
 
 def plot_refusion(response: Response) -> Figure:
-    """H as a landscape, and its slopes in q_g and q_l: hatched where they are negative.
+    """
+    Plot H and its slopes in q_g and q_l; negative slopes are hatched.
 
-    :param response: from :func:`refusion_response`
+    :param response: Output of :func:`refusion_response`
     """
     figure = Figure(figsize=(11.0, 3.7), layout="constrained")
     axes = figure.subplots(1, 3, sharex=True, sharey=True)
-    filled = axes[0].contourf(response.q_global, response.q_lve, response.h, levels=16, cmap="cividis")
+    surface = response.q_global, response.q_lve, response.h
+    filled = axes[0].contourf(*surface, levels=16, cmap="cividis")
     lines = axes[0].contour(
-        *(response.q_global, response.q_lve, response.h),
-        levels=filled.levels[::2],  # every second of those that are filled
-        colors="white",
-        linewidths=0.7,
-        negative_linestyles="solid",
+        *surface, levels=filled.levels[::2], colors="white", linewidths=0.7, negative_linestyles="solid"
     )
     figure.colorbar(filled, ax=axes[0]).add_lines(lines)
     axes[0].set_title("H", fontsize=MEDIUM)
-    # one scale for both, so that they can be compared
+    # Use the same scale for both slopes so that they can be compared
     reach = max(1.0, float(np.abs([response.slope_global, response.slope_lve]).max()))
     _draw_slope(figure, axes[1], response, response.slope_global, reach, r"$\partial H/\partial q_g$")
     _draw_slope(figure, axes[2], response, response.slope_lve, reach, r"$\partial H/\partial q_l$")
@@ -108,25 +110,14 @@ def plot_refusion(response: Response) -> Figure:
 
 
 def _draw_slope(figure: Figure, axis: Axes, response: Response, slope: np.ndarray, reach: float, name: str) -> None:
-    # purple below zero, orange above: told apart by colour-blind people, and by the hatch in greyscale
-    mesh = axis.pcolormesh(
-        response.q_global,
-        response.q_lve,
-        slope,
-        cmap="PuOr_r",
-        norm=TwoSlopeNorm(0.0, -reach, reach),
-        shading="nearest",
-        rasterized=True,
-    )
+    # Purple below zero and orange above can be distinguished by colour-blind people, and by the hatch in greyscale
+    grid = response.q_global, response.q_lve
+    norm = TwoSlopeNorm(0.0, -reach, reach)
+    mesh = axis.pcolormesh(*grid, slope, cmap="PuOr_r", norm=norm, shading="nearest", rasterized=True)
     figure.colorbar(mesh, ax=axis)
     negative = slope < 0
     if negative.any():
-        axis.contourf(
-            *(response.q_global, response.q_lve, negative.astype(float)),
-            levels=[0.5, 1.5],
-            colors="none",
-            hatches=["///"],
-        )
+        axis.contourf(*grid, negative.astype(float), levels=[0.5, 1.5], colors="none", hatches=["///"])
     low, high = slope.min(), slope.max()
     value = f"{low:.2f}" if np.isclose(low, high, atol=5e-3) else f"{low:.2f} to {high:.2f}"
     sign = f", negative on {100 * negative.mean():.0f} %" if negative.any() else ""

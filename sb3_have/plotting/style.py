@@ -1,4 +1,4 @@
-"""How things look in every picture: the same colour and line for the same modality, legible in greyscale too."""
+"""Colours, lines and legends that all figures share. Modalities and curves can be told apart in greyscale, too."""
 
 from __future__ import annotations
 
@@ -13,19 +13,9 @@ from numpy.typing import ArrayLike
 
 from sb3_have.envs.vision import MODALITIES
 
-# Okabe and Ito's colours, told apart by colour-blind people too
-COLOURS = {"rgb": "#D55E00", "event": "#0072B2", "depth": "#009E73"}
-SPARE_COLOURS = ("#CC79A7", "#E69F00", "#56B4E9", "#888888")
-LINES = {"rgb": "-", "event": "--", "depth": "-."}
-SPARE_LINES = (":", "-", "--", "-.")
-HATCHES = {"rgb": "", "event": "///", "depth": "..."}
-SPARE_HATCHES = ("xxx", "\\\\\\", "ooo", "")
-SMALL, MEDIUM = 9, 10
-"""Sizes of letters [pt]."""
-
 
 class Style(NamedTuple):
-    """How a curve, or a method, is drawn."""
+    """How a curve or a bar is drawn."""
 
     colour: str
     line: str = "-"
@@ -33,51 +23,59 @@ class Style(NamedTuple):
     hatch: str = ""
 
 
-CURVES = (
-    *(
-        Style("#000000", marker="o"),
-        Style("#D55E00", "--", "s"),
-        Style("#0072B2", "-.", "^"),
-        Style("#009E73", ":", "v"),
-    ),
-    *(
-        Style("#CC79A7", marker="D"),
-        Style("#E69F00", "--", "X"),
-        Style("#56B4E9", "-.", "P"),
-        Style("#888888", ":", "h"),
-    ),
+# The colours of Okabe and Ito, which colour-blind people can distinguish
+MODALITY_STYLES = {
+    "rgb": Style("#D55E00"),
+    "event": Style("#0072B2", "--", hatch="///"),
+    "depth": Style("#009E73", "-.", hatch="..."),
+}
+OTHER_MODALITIES = (
+    Style("#CC79A7", ":", hatch="xxx"),
+    Style("#E69F00", hatch="\\\\\\"),
+    Style("#56B4E9", "--", hatch="ooo"),
+    Style("#888888", "-."),
 )
-"""Looks of curves without one of their own, in order."""
+CURVES = (
+    Style("#000000"),
+    Style("#D55E00", "--", "s"),
+    Style("#0072B2", "-.", "^"),
+    Style("#009E73", ":", "v"),
+    Style("#CC79A7", "-", "D"),
+    Style("#E69F00", "--", "X"),
+    Style("#56B4E9", "-.", "P"),
+    Style("#888888", ":", "h"),
+)
+# Font sizes [pt]
+SMALL, MEDIUM = 9, 10
 
 
 def modality_colours(names: Iterable[str]) -> dict[str, str]:
-    """The same colour for a modality in every picture, and the same order of modalities.
-
-    :param names: of the modalities
     """
-    return {name: look.colour for name, look in modality_styles(names).items()}
+    Return the colour that each modality has in all figures.
+
+    :param names: Names of the modalities
+    """
+    return {name: style.colour for name, style in modality_styles(names).items()}
 
 
 def modality_styles(names: Iterable[str]) -> dict[str, Style]:
-    """Colour, line and hatch of modalities, in the order in which every picture shows them.
+    """
+    Return the style that each modality has in all figures, in the order of the figures.
 
-    :param names: of the modalities
+    :param names: Names of the modalities
     """
     ordered = sorted(names, key=position)
-    others = [name for name in ordered if name not in COLOURS]
-    looks = {}
-    for name in ordered:
-        spare = others.index(name) % len(SPARE_COLOURS) if name in others else 0
-        looks[name] = Style(
-            COLOURS.get(name, SPARE_COLOURS[spare]),
-            LINES.get(name, SPARE_LINES[spare]),
-            hatch=HATCHES.get(name, SPARE_HATCHES[spare]),
-        )
-    return looks
+    others = [name for name in ordered if name not in MODALITY_STYLES]
+    spare = {name: OTHER_MODALITIES[i % len(OTHER_MODALITIES)] for i, name in enumerate(others)}
+    return {name: MODALITY_STYLES.get(name) or spare[name] for name in ordered}
 
 
 def position(name: str) -> tuple[int, str]:
-    """Place of a modality among the others: rgb, event, depth, then those that are not known here by name."""
+    """
+    Return the sort key of a modality: rgb, event, depth, then the others by name.
+
+    :param name: Name of the modality
+    """
     return MODALITIES.index(name) if name in MODALITIES else len(MODALITIES), name
 
 
@@ -90,15 +88,16 @@ def draw_curve(
     label: str,
     emphasis: bool = False,
 ) -> None:
-    """A curve and the band around it.
+    """
+    Draw a curve and the band around it.
 
-    :param axis: to draw on
-    :param steps: (P,)
-    :param middle: (P,)
-    :param band: lowest and highest, (P,) each
-    :param look: of the curve
-    :param label: for the legend
-    :param emphasis: whether it is drawn thicker and above the others
+    :param axis: Axis to draw on
+    :param steps: Training steps, (P,)
+    :param middle: The curve, (P,)
+    :param band: Lower and upper end of the band, (P,) each
+    :param look: Style of the curve
+    :param label: Label in the legend
+    :param emphasis: Whether to draw the curve thicker and above the others
     """
     axis.plot(
         np.asarray(steps),
@@ -112,25 +111,41 @@ def draw_curve(
         label=label,
     )
     if band is not None:
-        lowest, highest = band
-        axis.fill_between(
-            np.asarray(steps), np.asarray(lowest), np.asarray(highest), color=look.colour, alpha=0.13, linewidth=0
-        )
+        lower, upper = map(np.asarray, band)
+        axis.fill_between(np.asarray(steps), lower, upper, color=look.colour, alpha=0.13, linewidth=0)
 
 
 def draw_whiskers(axis: Axes, places: Sequence[float], lowest: ArrayLike, highest: ArrayLike) -> None:
-    """Lines from the lowest to the highest, seen on a black bar too."""
+    """
+    Draw vertical lines with a white outline, which are visible on a black bar, too.
+
+    :param axis: Axis to draw on
+    :param places: Horizontal position of each line
+    :param lowest: Lower end of each line
+    :param highest: Upper end of each line
+    """
     outline = withStroke(linewidth=2.6, foreground="white")
     axis.vlines(places, lowest, highest, color="0.3", linewidth=1.2, zorder=3, path_effects=[outline])
 
 
-def legend_above(figure: Figure, handles: Sequence[Any], labels: Sequence[str], columns: int = 8) -> None:
-    """One legend for all panels, outside of them."""
-    figure.legend(handles, labels, fontsize=SMALL, loc="outside upper center", ncols=columns, frameon=False)
-
-
 def draw_levels(axis: Axes, levels: Mapping[str, float]) -> None:
-    """Horizontal lines to compare with, by name."""
-    styles = ("--", ":", "-.")
-    for number, (name, level) in enumerate(levels.items()):
-        axis.axhline(level, color="0.35", linestyle=styles[number % 3], linewidth=1, label=name, zorder=1)
+    """
+    Draw horizontal lines to compare with.
+
+    :param axis: Axis to draw on
+    :param levels: Height of each line by label
+    """
+    for i, (name, level) in enumerate(levels.items()):
+        axis.axhline(level, color="0.35", linestyle=("--", ":", "-.")[i % 3], linewidth=1, label=name, zorder=1)
+
+
+def legend_above(figure: Figure, handles: Sequence[Any], labels: Sequence[str], columns: int = 8) -> None:
+    """
+    Draw one legend above all panels.
+
+    :param figure: Figure to draw on
+    :param handles: Lines or bars to explain
+    :param labels: Their labels
+    :param columns: Number of columns
+    """
+    figure.legend(handles, labels, fontsize=SMALL, loc="outside upper center", ncols=columns, frameon=False)
