@@ -2,7 +2,7 @@
 
     python -m sb3_have.demo [--steps N] [--seed S] [--out runs/demo]
 
-Hyper-parameters are those of ``zoo_configs/havesac.yml``; :mod:`sb3_have.train` is the same for a long run.
+Hyper-parameters are those of ``zoo_configs/have-50k.yml``; :mod:`sb3_have.train` is the same for a long run.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
     :return: the evaluation of each driver
     """
     started = time.monotonic()
-    config = load_config("havesac", ENV_ID)
+    config = load_config("have-50k", ENV_ID)
     run = Run(config, ENV_ID, out, seed=seed, eval_freq=0, save_freq=0, time_limit=time_limit)
     with phase(f"Training for {steps} steps or {time_limit / 60:g} minutes (Ctrl-C: go on with what is learned)"):
         model = run.train(steps, progress_bar=True, keep_checkpoint=False)

@@ -25,15 +25,14 @@ from gymnasium import spaces
 from gymnasium.error import Error as GymnasiumError
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_have.algorithms import ALGORITHMS, saved_algorithm
 from sb3_have.checkpoint.archive import DamagedCheckpointError
 from sb3_have.checkpoint.checkpoint import checkpoint_info, checkpoints
-from sb3_have.checkpoint.saved_algorithm import saved_algorithm
 from sb3_have.configuration import env_wrapper, hyperparameter, load_config
 from sb3_have.envs.vision import MODALITIES
 from sb3_have.evaluation.recording import Recording, record_episode
 from sb3_have.evaluation.wrapping import saved_normalizer
 from sb3_have.plotting import write_animation
-from sb3_have.train import algorithms
 
 ENV_ID = "HighwayVision-v0"
 CAMERAS = (ENV_ID, "CarlaVision-v0")
@@ -87,7 +86,7 @@ def load_model(file: Path, algo: str | None = None, device: str = "auto") -> tup
     """Load a model to watch it, with a small replay buffer.
 
     :param file: a model or a checkpoint; the model is unpickled, as SB3 does
-    :param algo: name in :func:`sb3_have.train.algorithms`; None is the one that saved it
+    :param algo: name in :data:`sb3_have.algorithms.ALGORITHMS`; None is the one that saved it
     :param device: of the model
     :return: the model and the settings of its run, see :func:`read_model`
     :raises ValueError: if the file is no model, or of another algorithm
@@ -98,7 +97,7 @@ def load_model(file: Path, algo: str | None = None, device: str = "auto") -> tup
     if known is not None and name != known:
         raise ValueError(f"{file} was saved by {known}, not by {name}: leave --algo out")
     try:
-        model = algorithms()[name].load(saved, device=device, custom_objects={"buffer_size": 1000})
+        model = ALGORITHMS[name].load(saved, device=device, custom_objects={"buffer_size": 1000})
     except Exception as error:  # whatever a file of another kind makes SB3 stumble over
         raise ValueError(f"{file} cannot be loaded as {name}, give its --algo: {error!r}") from error
     return model, settings
@@ -174,7 +173,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, help="at most; default: the whole episode")
     parser.add_argument("--fps", type=float, help="frames per second; default: as fast as it was, at least 10")
     parser.add_argument("--width", type=int, default=640, help="of the picture [px]; default: %(default)s")
-    parser.add_argument("--algo", choices=list(algorithms()), help="default: the one that saved the model")
+    parser.add_argument("--algo", choices=list(ALGORITHMS), help="default: the one that saved the model")
     parser.add_argument(
         "--config", default="have", help="whose environment is used without a run's settings; default: %(default)s"
     )

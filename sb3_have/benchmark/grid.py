@@ -4,7 +4,7 @@ A grid is a YAML file; only ``methods`` and ``seeds`` have to be there::
 
     env: HighwayVision-v0
     steps: 30000
-    methods: [sac, lve, have]      # of zoo_configs, or files relative to the grid's; the name of a file is the method's
+    methods: [gve, lve, have]      # of zoo_configs, or files relative to the grid's; the name of a file is the method's
     seeds: [0, 1, 2]               # order of work: seed by seed over all methods
     weathers: [ClearNoon, ...]     # default: all eight
     hyperparams: {env_kwargs: {vehicles_count: 20}, batch_size: 64}
@@ -25,7 +25,6 @@ other sensors to every method that has several, and leaves ``rgb`` its one.
 
 from __future__ import annotations
 
-import inspect
 import json
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -37,16 +36,14 @@ from typing import Any
 import gymnasium as gym
 import yaml
 
-from sb3_have.configuration import config_path, load_config
+from sb3_have.configuration import algorithm_of, config_names, config_path, known_keys, load_config
 from sb3_have.envs.weather import WEATHERS
 from sb3_have.sensors import SENSORS, failures_for
-from sb3_have.train import algorithm_of, algorithms
 
 FINAL_SEED = 2_000_000
 """Seed of the first episode after training, the same for all methods and seeds. No run is trained on these episodes
 or chosen by them (:data:`sb3_have.train.EVALUATION_SEED`)."""
 
-NOT_OF_THE_MODEL = {"n_envs", "frame_stack", "env_kwargs", "env_wrapper"}
 OWN_ENVS = ("HighwayVision-v0", "CarlaVision-v0")
 
 
@@ -99,7 +96,8 @@ class Grid:
             raise GridError(f"--only: {self.name} has no {unknown[0]!r}{_remedy(unknown[0], names)}")
         configs = {name: self._config(method) for name, method in zip(names, self.methods, strict=True)}
         kept = [name for name in names if not only or name in only]
-        return [Job(self, name, seed, algorithm_of(name), configs[name]) for seed in self.seeds for name in kept]
+        algos = {name: algorithm_of(method) for name, method in zip(names, self.methods, strict=True)}
+        return [Job(self, name, seed, algos[name], configs[name]) for seed in self.seeds for name in kept]
 
     def _config(self, method: str) -> dict[str, Any]:
         try:
@@ -109,8 +107,8 @@ class Grid:
         config = merge(own, self.hyperparams)
         if self.modalities and len(config.get("env_kwargs", {}).get("modalities", self.modalities)) > 1:
             config["env_kwargs"] = {**config.get("env_kwargs", {}), "modalities": [*self.modalities]}
-        name, algo = method_name(method), algorithm_of(method_name(method))
-        known = {*inspect.signature(algorithms()[algo]).parameters, *NOT_OF_THE_MODEL}
+        name, algo = method_name(method), algorithm_of(method)
+        known = known_keys(algo)
         if unknown := [key for key in config if key not in known]:
             raise GridError(f"hyperparams: {algo} (for {name}) knows no {unknown[0]!r}{_remedy(unknown[0], known)}")
         return config
@@ -141,7 +139,7 @@ class Job:
     :param grid: to which it belongs
     :param method: its name
     :param seed: of the training
-    :param algo: name in :func:`sb3_have.train.algorithms`
+    :param algo: name in :data:`sb3_have.algorithms.ALGORITHMS`
     :param config: the method's hyper-parameters, merged with the grid's
     """
 
@@ -252,8 +250,7 @@ def _found(method: str, folder: Path) -> str:
     try:
         path = config_path(method)
     except FileNotFoundError:
-        known = [path.stem for path in config_path("havesac").parent.glob("*.yml")]
-        raise GridError(f"methods: there is no zoo_configs/{method}.yml{_remedy(method, known)}") from None
+        raise GridError(f"methods: there is no zoo_configs/{method}.yml{_remedy(method, config_names())}") from None
     if path == Path(method):
         raise GridError(f"methods: {method!r} is a file here; name it with its ending, .yml")
     return method

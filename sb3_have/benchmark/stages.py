@@ -26,6 +26,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_have import HAVESAC
+from sb3_have.algorithms import ALGORITHMS
 from sb3_have.benchmark.grid import Failures, Job
 from sb3_have.benchmark.machine import machine
 from sb3_have.benchmark.reading import FILES
@@ -36,7 +37,7 @@ from sb3_have.configuration import Env, env_wrapper, evaluation_env_kwargs
 from sb3_have.evaluation.episodes import EpisodeQueue, Task, match_observations
 from sb3_have.evaluation.evaluation import drive_tasks, episode_tasks, summarize
 from sb3_have.sensors import SENSORS, SensorFailure, failures_for
-from sb3_have.train import Run, algorithms
+from sb3_have.train import Run
 
 DIGITS = 4
 LOCK_SECONDS = 60.0
@@ -120,7 +121,7 @@ def _rollout(config: dict[str, Any]) -> float:
 def _reload(job: Job, folder: Path, record: dict[str, Any], device: str) -> OffPolicyAlgorithm:
     if told := difference(record["settings"], job.settings):
         raise ValueError(f"{folder} is of a run with other settings ({told}); choose another --runs, or remove it")
-    model = algorithms()[job.algo].load(folder / "model.zip", device=device)
+    model = ALGORITHMS[job.algo].load(folder / "model.zip", device=device)
     if model.num_timesteps != record["steps"]:
         raise ValueError(
             f"{folder / 'model.zip'} has gone on to step {model.num_timesteps} from step {record['steps']}, "

@@ -8,9 +8,11 @@ from sb3_contrib import CrossQ
 from sb3_contrib.crossq.policies import CrossQPolicy
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.torch_layers import CombinedExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, CombinedExtractor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
+
+from sb3_have.common.encoders import MultiModalExtractor
 
 
 class MultiInputPolicy(CrossQPolicy):
@@ -21,16 +23,33 @@ class MultiInputPolicy(CrossQPolicy):
         super().__init__(*args, **kwargs)
 
 
+class MultiModalCrossQPolicy(CrossQPolicy):
+    """
+    CrossQ's policy with :class:`~sb3_have.common.encoders.MultiModalExtractor` as the default features extractor.
+
+    :param features_extractor_class: Features extractor to use
+    :param normalize_images: Whether SB3 divides images by 255; the encoders decode the bytes themselves
+    """
+
+    def __init__(
+        self,
+        *args: Any,
+        features_extractor_class: type[BaseFeaturesExtractor] = MultiModalExtractor,
+        normalize_images: bool = False,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(
+            *args, features_extractor_class=features_extractor_class, normalize_images=normalize_images, **kwargs
+        )
+
+
 class MultiInputCrossQ(CrossQ):
     """
-    CrossQ (Bhatt et al. 2024) that also knows ``"MultiInputPolicy"``; the algorithm is sb3-contrib's, untouched.
+    CrossQ (Bhatt et al. 2024) that also accepts ``"MultiInputPolicy"``; the algorithm is sb3-contrib's, untouched.
 
-    Its training step joins observations and next observations by ``torch.cat``, as the joint batch statistics ask for;
-    here they come as dictionaries that ``torch.cat`` joins key by key. The features extractor is SB3's
-    ``CombinedExtractor`` by default; with the encoders of HAVESAC it is::
-
-        MultiInputCrossQ("MultiInputPolicy", env,
-                         policy_kwargs=dict(features_extractor_class=MultiModalExtractor, normalize_images=False))
+    Its training step joins observations and next observations by ``torch.cat``, because the batch statistics are those
+    of both. Here they come as dictionaries that ``torch.cat`` joins key by key. ``"MultiInputPolicy"`` uses SB3's
+    ``CombinedExtractor``; :class:`MultiModalCrossQPolicy` uses the encoders of HAVESAC.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {

@@ -17,11 +17,10 @@ from pathlib import Path
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_have.checkpoint.saved_algorithm import saved_algorithm
+from sb3_have.algorithms import ALGORITHMS, saved_algorithm
 from sb3_have.export.config import NORMALIZED
 from sb3_have.export.onnx import export_onnx
 from sb3_have.export.safetensors import CONFIG_FILE, export_safetensors, load_policy, read_config
-from sb3_have.train import algorithms
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -32,7 +31,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("model", type=Path, metavar="MODEL", help="zip of model.save (trusted!), or exported folder")
     parser.add_argument("--format", choices=["onnx", "safetensors"], required=True)
     parser.add_argument("--out", type=Path, help="file (onnx) or folder (safetensors); default: named after MODEL")
-    parser.add_argument("--algo", choices=list(algorithms()), help="of a zip; default: by its policy")
+    parser.add_argument("--algo", choices=list(ALGORITHMS), help="of a zip; default: by its policy")
     args = parser.parse_args(arguments)
     source: Path = args.model
     out: Path = args.out or source.with_name(source.stem + (".onnx" if args.format == "onnx" else "_safetensors"))
@@ -72,7 +71,7 @@ def load_zip(path: Path, algo: str | None = None) -> BaseAlgorithm:
     if algo is not None and found not in (None, algo):
         raise ValueError(f"{path}: its policy is of {found}, not of {algo}: leave out --algo")
     try:
-        return algorithms()[algo or found or "havesac"].load(path, device="cpu", buffer_size=1)
+        return ALGORITHMS[algo or found or "havesac"].load(path, device="cpu", buffer_size=1)
     except Exception as error:  # whatever pickle makes of a damaged file
         raise ValueError(f"{path} cannot be loaded: {type(error).__name__}: {error}") from error
 

@@ -31,6 +31,7 @@ from torch.nn.parameter import is_lazy
 
 from sb3_have.common import crossq, encoders, fusion
 from sb3_have.common.buffers import stacked_frames
+from sb3_have.common.tqc import MultiModalTQCPolicy
 from sb3_have.have.deepmdp import DeepMDP
 from sb3_have.have.have import HAVESAC
 from sb3_have.have.policies import MultiModalPolicy
@@ -43,6 +44,8 @@ OPTIMIZERS = ("Adam", "AdamW", "Adamax", "NAdam", "RAdam", "RMSprop", "SGD")
 CLASSES: dict[str, type[Any]] = {
     "sb3_have.MultiModalPolicy": MultiModalPolicy,
     "sb3_have.common.crossq.MultiInputPolicy": crossq.MultiInputPolicy,
+    "sb3_have.common.crossq.MultiModalCrossQPolicy": crossq.MultiModalCrossQPolicy,
+    "sb3_have.common.tqc.MultiModalTQCPolicy": MultiModalTQCPolicy,
     "sb3_contrib.crossq.policies.CrossQPolicy": CrossQPolicy,
     **{
         f"sb3_contrib.tqc.policies.{name}": getattr(tqc, name)
