@@ -113,15 +113,14 @@ def register() -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Command line of ``python -m sb3_have.zoo``."""
-    parser = argparse.ArgumentParser(prog="python -m sb3_have.zoo", usage="%(prog)s {train,tune,enjoy} [options]")
-    parser.add_argument("command", choices=["train", "tune", "enjoy"])
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    if not given or given[0] in ("-h", "--help"):
+    command, *given = (sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    if command in ("-h", "--help"):
         print(__doc__)
         return
-    command = parser.parse_args(given[:1]).command
+    if command not in ("train", "tune", "enjoy"):
+        sys.exit(f"there is no command {command!r}; there are train, tune and enjoy")
     register()
-    before, sys.argv = sys.argv, [f"{parser.prog} {command}", *zoo_arguments(command, given[1:])]
+    before, sys.argv = sys.argv, [f"sb3_have.zoo {command}", *zoo_arguments(command, given)]
     try:
         if command == "enjoy":
             import_module("rl_zoo3.enjoy").enjoy()

@@ -120,7 +120,7 @@ def test_a_world_that_a_crashed_client_left_synchronous(
 def test_a_training_and_its_evaluation_as_configured(
     monkeypatch: pytest.MonkeyPatch, server: Server, env: CarlaVisionEnv
 ) -> None:
-    config = load_config("havesac", "CarlaVision-v0")
+    config = load_config("have", "CarlaVision-v0")
     kwargs = evaluation_env_kwargs(config) | {"port": 2010, "tm_port": 8010}  # --eval-env-kwargs
     other = Server(port=2010)
     install(monkeypatch, server, other)
