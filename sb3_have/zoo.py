@@ -140,7 +140,7 @@ def zoo_arguments(command: str, given: Sequence[str]) -> list[str]:
     """
     is_enjoy = command == "enjoy"
     parser = argparse.ArgumentParser(prog=f"python -m sb3_have.zoo {command}", add_help=False, allow_abbrev=False)
-    parser.add_argument("--method", choices=config_names())
+    parser.add_argument("--method", choices=config_names(), metavar="NAME")
     words = parser.parse_known_args(given)[1]
     parser.add_argument("--algo")
     parser.add_argument("--env", default="HighwayVision-v0")

@@ -21,10 +21,10 @@ from envs import (
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback, CheckpointCallback, EvalCallback
 from stable_baselines3.common.envs import SimpleMultiObsEnv
+from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecTransposeImage
-from stable_baselines3.common.evaluation import evaluate_policy
 
 from sb3_have import HAVESAC, MultiModalPolicy
 from sb3_have.have import policies

@@ -19,8 +19,8 @@ from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
 
 from sb3_have import HAVESAC, train, watch
-from sb3_have.checkpoint.checkpoint import save_checkpoint
 from sb3_have.algorithms import saved_algorithm
+from sb3_have.checkpoint.checkpoint import save_checkpoint
 from sb3_have.evaluation.recording import Recording, record_episode
 from sb3_have.evaluation.wrapping import saved_normalizer, wrap_as_trained
 from sb3_have.plotting import Frames, animation, write_animation
