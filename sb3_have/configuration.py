@@ -55,7 +55,7 @@ ZOO_KEYS = (
 CLASS_OR_WORD = ("policy", "activation_fn", "fusion", "auxiliary")
 
 # Keys whose value may be Python code
-PYTHON = ("policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs", "normalize", "monitor_kwargs")
+PYTHON = ("policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs")
 
 DOTTED_PATH = re.compile(r"\w+(\.\w+)+")
 
@@ -147,7 +147,7 @@ def algorithm_of(name: str | Path) -> str:
 
 
 def _base(name: str | Path, content: Mapping[str, Any]) -> str | Path:
-    """A file beside the one that names it, or a name in ``zoo_configs``."""
+    """Return the base: a file beside the one that names it, or a name in ``zoo_configs``."""
     beside = config_path(name).parent / content["base"]
     return beside if beside.is_file() else str(content["base"])
 
@@ -206,7 +206,7 @@ def _resolve(key: str, value: Any) -> Any:
             return _python(key, value)
         if is_class or (key in CLASS_OR_WORD and "." in value):
             return _locate(value, key)
-    if key in INTEGERS and isinstance(value, float):
+    if key in INTEGERS and isinstance(value, float) and value.is_integer():
         return int(value)
     if key == "train_freq" and isinstance(value, list):
         return tuple(value)

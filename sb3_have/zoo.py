@@ -56,7 +56,7 @@ class HaveExperimentManager(ExperimentManager):
         trial_id, self.trial_id = self.trial_id, None
         hyperparams, saved = super().read_hyperparameters()
 
-        # Resolve dotted paths of classes and Python code
+        # Resolve dotted paths of classes, which the Zoo knows for the policy alone
         left_to_the_zoo = ("policy", "learning_rate", "noise_type")
         hyperparams.update(model_kwargs({key: hyperparams[key] for key in hyperparams if key not in left_to_the_zoo}))
 
@@ -66,7 +66,7 @@ class HaveExperimentManager(ExperimentManager):
             for values in (hyperparams, saved):
                 values.update({key: value for key, value in trial.items() if key not in given})
 
-        # Store the frames of stacked images once
+        # Store each frame of stacked images once, as sb3_have.train does
         n_stack = hyperparams.get("frame_stack") or 1
         if self.algo in ("tqc", "crossq") and n_stack > 1 and not {"replay_buffer_class", "n_steps"} & set(hyperparams):
             hyperparams["replay_buffer_class"] = ModalityReplayBuffer
@@ -138,7 +138,6 @@ def zoo_arguments(command: str, given: Sequence[str]) -> list[str]:
     :param command: "train", "tune" or "enjoy"
     :param given: The Zoo's options, and ``--method``
     """
-    is_enjoy = command == "enjoy"
     parser = argparse.ArgumentParser(prog=f"python -m sb3_have.zoo {command}", add_help=False, allow_abbrev=False)
     parser.add_argument("--method", choices=config_names(), metavar="NAME")
     words = parser.parse_known_args(given)[1]
@@ -147,13 +146,13 @@ def zoo_arguments(command: str, given: Sequence[str]) -> list[str]:
     parser.add_argument("-f", "--folder", "--log-folder", dest="folder")
     parser.add_argument("--gym-packages", nargs="+", default=[])
     parser.add_argument("--trial-id")
-    if not is_enjoy:
-        parser.add_argument("-conf", "--conf-file")
+    parser.add_argument("-conf", "--conf-file")
     options = parser.parse_known_args(given)[0]
     for package in options.gym_packages:
         import_module(package)
 
-    conf = options.method or (None if is_enjoy else options.conf_file)
+    # Find the configuration, its algorithm, and the log folder
+    conf = options.method or options.conf_file
     if conf is None and options.algo in (None, "havesac"):
         conf = "have"
     elif conf is None and options.algo in config_names() and options.env in read_config(options.algo):
@@ -163,7 +162,7 @@ def zoo_arguments(command: str, given: Sequence[str]) -> list[str]:
     algo = algorithm_of(conf) if conf is not None and conf.endswith((".yml", ".yaml")) else "havesac"
     folder = options.folder or (f"logs/{options.method}" if options.method else "logs")
     defaults = ["--algo", algo, "--env", options.env, "-f", folder]
-    if is_enjoy:
+    if command == "enjoy":
         return [*defaults, *words, *([] if can_render(options.env) else ["--no-render"])]
     if command == "tune" or options.trial_id is not None:
         name = Path(conf).stem if conf is not None else options.algo
@@ -171,8 +170,8 @@ def zoo_arguments(command: str, given: Sequence[str]) -> list[str]:
     if command == "tune":
         # With the Zoo's single evaluation of 5 episodes nothing is pruned, and noise decides
         defaults += ["--optimize-hyperparameters", "--n-evaluations", "3", "--eval-episodes", "10"]
-    elif options.env == "CarlaVision-v0":
-        # An evaluation needs a second server, which --eval-freq asks for
+    elif options.env == "CarlaVision-v0" and "--eval-env-kwargs" not in words:
+        # An evaluation needs the port of a second server
         defaults += ["--eval-freq", "-1"]
     return [*defaults, *words, *([] if conf is None else ["--conf-file", conf])]
 

@@ -14,7 +14,7 @@ from stable_baselines3.common.policies import ContinuousCritic
 from torch import nn
 
 from sb3_have import HAVESAC, ModalityReplayBuffer
-from sb3_have.algorithms import ALGORITHMS
+from sb3_have.algorithms import ALGORITHMS, saved_algorithm
 from sb3_have.benchmark.grid import read_grid
 from sb3_have.common.encoders import MultiModalExtractor
 from sb3_have.configuration import algorithm_of, config_names, config_path, load_config, model_kwargs
@@ -157,6 +157,7 @@ def test_method_trains_and_comes_back(method: str, tmp_path: Path) -> None:
     actions, _ = model.predict(observations, deterministic=True)
     assert actions.shape == (16, 2) and np.isfinite(actions).all()
     assert (np.abs(actions) <= 1).all() and actions.std(axis=0).min() > 0
+    assert saved_algorithm(tmp_path / "model.zip", method) == algorithm_of(method)
     loaded = ALGORITHMS[algorithm_of(method)].load(tmp_path / "model.zip", device="cpu")
     np.testing.assert_array_equal(loaded.predict(observations, deterministic=True)[0], actions)
 

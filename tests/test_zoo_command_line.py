@@ -68,6 +68,8 @@ def test_options_of_the_user_stay() -> None:
 def test_carla_has_one_server() -> None:
     assert option(zoo_arguments("train", ["--env", CARLA]), "--eval-freq") == "-1"
     assert option(zoo_arguments("train", ["--env", CARLA, "--eval-freq", "9"]), "--eval-freq") == "9"
+    second_server = ["--eval-env-kwargs", "port:2010"]
+    assert option(zoo_arguments("train", ["--env", CARLA, *second_server]), "--eval-freq") is None
     assert option(zoo_arguments("train", ["--env", DRIVING]), "--eval-freq") is None
 
 
