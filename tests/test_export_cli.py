@@ -63,7 +63,7 @@ def test_wrong_files(tmp_path: Path, zipped: Path) -> None:
         archive.writestr("policy.pth", b"")
     assert "other.zip is not a model that SB3 saved" in run(tmp_path / "other.zip", *to_onnx)
     PPO("MlpPolicy", RandomSensors(vector(3)), device="cpu").save(tmp_path / "ppo.zip")
-    assert "ppo.zip: its policy is of stable_baselines3.common.policies, and only" in run(
+    assert "ppo.zip: its policy is from stable_baselines3.common.policies; supported" in run(
         tmp_path / "ppo.zip", *to_onnx
     )
     assert "model.zip: its policy is of havesac, not of tqc" in run(zipped, *to_onnx, "--algo", "tqc")
