@@ -1,7 +1,7 @@
 """Measure how far a trained model drives when one of its sensors fails for whole episodes.
 
     python -m sb3_have.demo                                              # trains a model
-    python -m benchmarks.failures runs/demo/havesac_demo.zip --config havesac
+    python -m benchmarks.failures runs/demo/havesac_demo.zip --config have-50k
 
 Each of rgb, event and depth fails in every way that it can, at one severity, outside the configuration's own
 ``env_wrapper``. All cases have the same episodes, in all weathers. Each row is appended to the CSV file when it is
@@ -87,7 +87,7 @@ def drive(
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("model", type=Path, help="zip file of a HAVESAC model")
-    parser.add_argument("--config", default="havesac", help="configuration of its training")
+    parser.add_argument("--config", default="have-50k", help="configuration of its training")
     parser.add_argument("--env", default="HighwayVision-v0")
     parser.add_argument("--severity", type=int, default=3, choices=(1, 2, 3))
     parser.add_argument("--episodes", type=int, default=2, help="episodes in each weather")

@@ -1,7 +1,7 @@
 """Collect runs of ``sb3_have.train`` and plot how well HAVESAC learns to drive.
 
     for seed in 0 1 2; do for precision in float32 bfloat16; do
-        OMP_NUM_THREADS=1 python -m sb3_have.train --config havesac --seed $seed --steps 10000 \\
+        OMP_NUM_THREADS=1 python -m sb3_have.train --config have-50k --seed $seed --steps 10000 \\
             --eval-freq 2500 --eval-episodes 1 --hyperparams "policy_kwargs:{precision: $precision}" \\
             --out runs/$precision-$seed
     done; done

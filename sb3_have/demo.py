@@ -3,7 +3,7 @@ Train HAVESAC on HighwayVision-v0 for a few minutes, compare it with rule-based 
 
     python -m sb3_have.demo [--steps N] [--seed S] [--out runs/demo]
 
-Hyperparameters are those of ``zoo_configs/havesac.yml``. Use :mod:`sb3_have.train` for longer runs.
+Hyperparameters are those of ``zoo_configs/have-50k.yml``. Use :mod:`sb3_have.train` for longer runs.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
     :return: Evaluation of each driver
     """
     started = time.monotonic()
-    config = load_config("havesac", ENV_ID)
+    config = load_config("have-50k", ENV_ID)
     run = Run(config, ENV_ID, out, seed=seed, eval_freq=0, save_freq=0, time_limit=time_limit)
     with phase(f"Training for {steps} steps or {time_limit / 60:g} minutes (Ctrl-C to stop earlier)"):
         model = run.train(steps, progress_bar=True, keep_checkpoint=False)

@@ -1,6 +1,6 @@
 """Train by a configuration of ``zoo_configs``: a run that can be stopped and resumed at any moment.
 
-    python -m sb3_have.train --config havesac --env HighwayVision-v0 --steps 200000 --seed 0 --out runs/have-0
+    python -m sb3_have.train --config have --env HighwayVision-v0 --steps 200000 --seed 0 --out runs/have-0
 
 The same command resumes. The folder holds ``monitor.csv`` (training episodes), ``evaluation.csv`` (a row per weather
 at every evaluation), ``log-<first step>/progress.csv`` (SB3's log), the newest two ``checkpoint-<step>`` and
@@ -21,14 +21,13 @@ from typing import Any
 
 import gymnasium as gym
 import pandas as pd
-from sb3_contrib import TQC
-from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.logger import configure
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize
 
-import sb3_have
+from sb3_have.algorithms import ALGORITHMS
 from sb3_have.checkpoint import (
     ResumableCheckpointCallback,
     ResumableEnv,
@@ -41,9 +40,20 @@ from sb3_have.checkpoint import (
 )
 from sb3_have.checkpoint.files import locked, write_atomically
 from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
-from sb3_have.common.crossq import MultiInputCrossQ
 from sb3_have.common.memory import keep_freed_memory
-from sb3_have.configuration import env_wrapper, evaluation_env_kwargs, hyperparameter, load_config, model_kwargs
+from sb3_have.configuration import (
+    algorithm_of,
+    check_keys,
+    env_wrapper,
+    evaluation_env_kwargs,
+    hyperparameter,
+    load_config,
+    make_callbacks,
+    model_kwargs,
+    monitor_kwargs,
+    normalize_kwargs,
+    wrap_vec_env,
+)
 from sb3_have.envs.weather import WEATHERS
 from sb3_have.evaluation.callback import WeatherEvalCallback
 from sb3_have.evaluation.episodes import leave_interrupts_to_parent
@@ -52,43 +62,36 @@ VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {"dummy": DummyVe
 """By the Zoo's names."""
 
 
-def algorithms() -> dict[str, type[OffPolicyAlgorithm]]:
-    """Algorithms by name. SB3's SAC is for comparisons outside of ``zoo_configs``, whose ``sac`` is HAVESAC's."""
-    return {"havesac": sb3_have.HAVESAC, "sac": SAC, "tqc": TQC, "crossq": MultiInputCrossQ}
-
-
-def algorithm_of(config: str) -> str:
-    """Name of the algorithm that a configuration is for: "tqc" and "crossq" by their names, HAVESAC else.
-
-    :param config: name or file of the configuration
-    """
-    name = Path(config).stem
-    return name if name in ("tqc", "crossq") else "havesac"
-
-
 def make_training_env(env_id: str, config: Mapping[str, Any], out: Path | None = None) -> VecEnv:
-    """The environments of a configuration, with their frame stack.
+    """Make the environments of a configuration, wrapped as the Zoo wraps them.
 
-    :param config: ``env_kwargs``, ``env_wrapper``, ``frame_stack`` and ``n_envs`` are used; several run in processes of
-        their own
-    :param out: folder in whose ``monitor.csv`` (``<i>.monitor.csv`` for several) the episodes are appended
+    :param env_id: Environment id
+    :param config: Hyper-parameters; several environments (``n_envs``) run in processes of their own
+    :param out: Folder in whose ``monitor.csv`` (``<i>.monitor.csv`` for several environments) episodes are appended
     """
+    n_envs, wrapper, monitored = config.get("n_envs", 1), env_wrapper(config), monitor_kwargs(config)
 
     def make(index: int) -> gym.Env[Any, Any]:
         leave_interrupts_to_parent()
         env = gym.make(env_id, **config.get("env_kwargs", {}))
         env = env if wrapper is None else wrapper(env)
-        told = env.reset()[1]
-        keywords = tuple(key for key in ("distance", "weather", "end_reason") if key in told)
-        if out is None:
-            return ResumableEnv(Monitor(env, info_keywords=keywords))
-        file = out / (f"{index}.monitor.csv" if n_envs > 1 else "monitor.csv")
-        return ResumableEnv(Monitor(env, str(file), info_keywords=keywords, override_existing=not file.exists()))
 
-    n_envs, wrapper = config.get("n_envs", 1), env_wrapper(config)
+        # Record what the environments of this package know about an episode
+        info = env.reset()[1]
+        keywords = [key for key in ("distance", "weather", "end_reason") if key in info]
+        kwargs = {**monitored, "info_keywords": (*keywords, *monitored.get("info_keywords", ()))}
+        if out is None:
+            return ResumableEnv(Monitor(env, **kwargs))
+        file = out / (f"{index}.monitor.csv" if n_envs > 1 else "monitor.csv")
+        return ResumableEnv(Monitor(env, str(file), override_existing=not file.exists(), **kwargs))
+
     makers: list[Callable[[], gym.Env[Any, Any]]] = [partial(make, index) for index in range(n_envs)]
-    vec_env: VecEnv = SubprocVecEnv(makers) if n_envs > 1 else DummyVecEnv(makers)
-    return VecFrameStack(vec_env, config["frame_stack"]) if config.get("frame_stack", 1) > 1 else vec_env
+    vec_env = wrap_vec_env(config, SubprocVecEnv(makers) if n_envs > 1 else DummyVecEnv(makers))
+    normalize = normalize_kwargs(config)
+    if normalize is not None:
+        vec_env = VecNormalize(vec_env, **normalize)
+    n_stack = config.get("frame_stack") or 1
+    return VecFrameStack(vec_env, n_stack) if n_stack > 1 else vec_env
 
 
 class Run:
@@ -98,7 +101,7 @@ class Run:
     :param env_id: Id of the environment
     :param out: Folder of the run; an earlier run in it is resumed, and must have had the same settings
     :param seed: Seed of everything random
-    :param algo: name in :func:`algorithms`
+    :param algo: Name in :data:`sb3_have.algorithms.ALGORITHMS`
     :param eval_freq: Steps from one evaluation to the next, 0 for none
     :param eval_episodes: Episodes in each weather of an evaluation
     :param eval_envs: Number of environments that an evaluation drives at a time, with one ``predict`` for all of them
@@ -170,9 +173,13 @@ class Run:
         self, checkpoint: Path | None, env: VecEnv, steps: int, progress_bar: bool, keep_checkpoint: bool
     ) -> OffPolicyAlgorithm:
         stop = StopTrainingOnSignal(self.time_limit)
-        callbacks = [stop, self._make_evaluation(seconds_before=self.seconds, progress_bar=progress_bar)]
+        callbacks: list[BaseCallback] = [
+            stop,
+            self._make_evaluation(seconds_before=self.seconds, progress_bar=progress_bar),
+        ]
         if keep_checkpoint:
             callbacks.insert(0, ResumableCheckpointCallback(self.out, self.save_freq, info=self._info))
+        callbacks += make_callbacks(self.config)
 
         if checkpoint is None:
             model = self._make_model(env)
@@ -233,13 +240,13 @@ class Run:
         write_atomically(monitor, partial(Path.write_text, data="".join([head, *lines[: kept + 1]])))
 
     def _make_model(self, env: VecEnv) -> OffPolicyAlgorithm:
-        kwargs = model_kwargs(self.config)
+        kwargs = model_kwargs(self.config, env)
         if self.algo != "havesac" and "replay_buffer_class" not in kwargs:  # as HAVESAC has by default
             derived = {"n_stack": stacked_frames(env), "n_steps": kwargs.pop("n_steps", 1)}
             derived |= {"gamma": kwargs.get("gamma", 0.99)}
             kwargs["replay_buffer_class"] = ModalityReplayBuffer
             kwargs["replay_buffer_kwargs"] = derived | kwargs.get("replay_buffer_kwargs", {})
-        return algorithms()[self.algo](env=env, seed=self.seed, device=self.device, **kwargs)
+        return ALGORITHMS[self.algo](env=env, seed=self.seed, device=self.device, **kwargs)
 
     def _settings(self) -> dict[str, Any]:
         config = {key: value for key, value in self.config.items() if key != "n_timesteps"}
@@ -254,8 +261,10 @@ class Run:
 def main(arguments: list[str] | None = None) -> None:
     """Command line of ``python -m sb3_have.train``."""
     parser = argparse.ArgumentParser(prog="python -m sb3_have.train", description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--config", default="havesac", help="YAML file, or the name of one in zoo_configs")
-    parser.add_argument("--algo", choices=list(algorithms()), help="default: by the configuration's name")
+    parser.add_argument(
+        "--config", default="have", help="YAML file, or the name of one in zoo_configs; default: %(default)s"
+    )
+    parser.add_argument("--algo", choices=list(ALGORITHMS), help="default: the one that the configuration names")
     parser.add_argument("--env", default="HighwayVision-v0", help="environment id")
     parser.add_argument(
         "--hyperparams",
@@ -297,12 +306,14 @@ def main(arguments: list[str] | None = None) -> None:
     args = parser.parse_args(arguments)
 
     config = load_config(args.config, args.env) | dict(args.hyperparams)
+    algo = args.algo or algorithm_of(args.config)
+    check_keys(config, algo)
     run = Run(
         config,
         args.env,
         args.out,
         seed=args.seed,
-        algo=args.algo or algorithm_of(args.config),
+        algo=algo,
         eval_freq=args.eval_freq,
         eval_episodes=args.eval_episodes,
         eval_envs=args.eval_envs,

@@ -26,15 +26,14 @@ from gymnasium import spaces
 from gymnasium.error import Error as GymnasiumError
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_have.algorithms import ALGORITHMS, saved_algorithm
 from sb3_have.checkpoint.archive import DamagedCheckpointError
 from sb3_have.checkpoint.checkpoint import checkpoint_info, checkpoints
-from sb3_have.checkpoint.saved_algorithm import saved_algorithm
 from sb3_have.configuration import env_wrapper, hyperparameter, load_config
 from sb3_have.envs.vision import MODALITIES
 from sb3_have.evaluation.recording import Recording, record_episode
 from sb3_have.evaluation.wrapping import saved_normalizer
 from sb3_have.plotting import write_animation
-from sb3_have.train import algorithms
 
 ENV_ID = "HighwayVision-v0"
 # Environments with the keywords `modalities` and `image_size`
@@ -94,7 +93,7 @@ def load_model(file: Path, algo: str | None = None, device: str = "auto") -> tup
     if known not in (None, name):
         raise ValueError(f"{file} was saved by {known}, not by {name}: leave out --algo")
     try:
-        model = algorithms()[name].load(saved, device=device, custom_objects={"buffer_size": 1000})
+        model = ALGORITHMS[name].load(saved, device=device, custom_objects={"buffer_size": 1000})
     except Exception as error:  # whatever SB3 raises for a file of another kind
         raise ValueError(f"{file} cannot be loaded as {name}, try --algo: {error!r}") from error
     return model, settings
@@ -174,7 +173,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, help="largest number of steps; default: the whole episode")
     parser.add_argument("--fps", type=float, help="frames per second; default: real time, but at least 10")
     parser.add_argument("--width", type=int, default=640, help="width of the film [px]; default: %(default)s")
-    parser.add_argument("--algo", choices=list(algorithms()), help="default: the one that saved the model")
+    parser.add_argument("--algo", choices=list(ALGORITHMS), help="default: the one that saved the model")
     parser.add_argument(
         "--config",
         default="have",

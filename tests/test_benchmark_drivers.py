@@ -14,7 +14,7 @@ from sb3_have.evaluation.evaluation import evaluate_episodes
 
 def write_grid(folder: Path, **changes: object) -> Path:
     env_kwargs = {"image_size": 36, "max_episode_steps": 20, "vehicles_count": 3}
-    given = {"methods": ["rgb", "sac"], "seeds": [0], "weathers": ["WetNoon", "ClearNight"], "final_episodes": 2}
+    given = {"methods": ["rgb", "gve"], "seeds": [0], "weathers": ["WetNoon", "ClearNight"], "final_episodes": 2}
     path = folder / "small.yml"
     path.write_text(yaml.safe_dump({**given, "hyperparams": {"env_kwargs": env_kwargs}, **changes}))
     return path

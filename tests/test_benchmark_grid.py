@@ -16,7 +16,7 @@ GRIDS = Path(__file__).parent.parent / "benchmarks" / "grids"
 
 
 def write(folder: Path, **changes: Any) -> Path:
-    given = {"methods": ["sac", "have"], "seeds": [0, 1], **changes}
+    given = {"methods": ["gve", "have"], "seeds": [0, 1], **changes}
     path = folder / "mine.yml"
     path.write_text(yaml.safe_dump({key: value for key, value in given.items() if value is not None}))
     return path
@@ -24,7 +24,7 @@ def write(folder: Path, **changes: Any) -> Path:
 
 def test_order_is_seed_by_seed(tmp_path: Path) -> None:
     grid = read_grid(write(tmp_path))
-    assert [job.name for job in grid.jobs()] == ["sac-0", "have-0", "sac-1", "have-1"]
+    assert [job.name for job in grid.jobs()] == ["gve-0", "have-0", "gve-1", "have-1"]
     assert [job.name for job in grid.jobs(only=["have"])] == ["have-0", "have-1"]
     assert grid.name == "mine" and grid.weathers == WEATHERS and grid.failures is None
     with pytest.raises(GridError, match="--only: unknown name 'lve'"):
@@ -70,7 +70,7 @@ def test_modalities_reach_methods_of_several(tmp_path: Path) -> None:
 
 
 def test_algorithm_follows_from_the_method(tmp_path: Path) -> None:
-    grid = read_grid(write(tmp_path, methods=["tqc", "crossq", "sac"], seeds=[3]))
+    grid = read_grid(write(tmp_path, methods=["tqc", "crossq", "gve"], seeds=[3]))
     assert [job.algo for job in grid.jobs()] == ["tqc", "crossq", "havesac"]
 
 
@@ -168,7 +168,7 @@ def test_shipped_grids_train_alike() -> None:
 
 def test_a_carla_server_has_one_environment(tmp_path: Path) -> None:
     path = tmp_path / "carla.yml"
-    text = "env: CarlaVision-v0\nmethods: [havesac]\nseeds: [0]\n"
+    text = "env: CarlaVision-v0\nmethods: [have]\nseeds: [0]\n"
     path.write_text(text)
     with pytest.raises(GridError, match="eval_envs: 1"):
         read_grid(path)

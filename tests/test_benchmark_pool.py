@@ -15,6 +15,7 @@ import pytest
 from fake_drive import ENV_ID
 from tiny_grid import LocalPool, make_grid, read
 
+from sb3_have.algorithms import ALGORITHMS
 from sb3_have.benchmark import stages
 from sb3_have.benchmark.grid import FINAL_SEED
 from sb3_have.benchmark.reading import read_results
@@ -23,7 +24,6 @@ from sb3_have.benchmark.runner import FINISHED, STOPPED, Runner
 from sb3_have.benchmark.stages import run_job
 from sb3_have.checkpoint import checkpoint_step, newest_checkpoint
 from sb3_have.evaluation.evaluation import evaluate_episodes
-from sb3_have.train import algorithms
 
 
 def wait_until(happened: Callable[[], bool], process: subprocess.Popen[bytes], seconds: float = 240.0) -> None:
@@ -109,7 +109,7 @@ def test_benchmark_survives_sigterm_sigkill_and_a_dead_worker(tmp_path: Path, mo
     for job in jobs:
         assert is_finished(results, job)
         assert pd.read_csv(runs / job.name / "monitor.csv", skiprows=1)["l"].sum() <= 150, "no step is counted twice"
-        model = algorithms()[job.algo].load(runs / job.name / "model.zip")
+        model = ALGORITHMS[job.algo].load(runs / job.name / "model.zip")
         rows = read(results, "episodes").query("method == @job.method and weather == 'slow'")
         driven = evaluate_episodes(model, ENV_ID, ["slow"], 3, FINAL_SEED)
         np.testing.assert_allclose(rows["return"], driven["return"], atol=1e-3, err_msg="of the saved model")

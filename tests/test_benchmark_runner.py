@@ -19,7 +19,6 @@ from sb3_have.benchmark.results import merge
 from sb3_have.benchmark.runner import FAILED, FINISHED, STOPPED, Runner
 from sb3_have.benchmark.stages import collect, run_job
 from sb3_have.checkpoint import StopTrainingOnSignal
-from sb3_have.train import algorithms
 
 
 @pytest.fixture
@@ -85,7 +84,7 @@ def test_results_of_a_grid(tmp_path: Path) -> None:
 
     table = read(results, "runs")
     assert (table["steps"] == 30).all() and (table["minutes"] > 0).all()
-    model = algorithms()["havesac"].load(runs / "gve-0" / "model.zip")
+    model = HAVESAC.load(runs / "gve-0" / "model.zip")
     assert isinstance(model, HAVESAC)
     of_target, everything = (
         sum(p.numel() for p in part.parameters()) for part in (model.policy.critic_target, model.policy)

@@ -1,52 +1,117 @@
-"""Configurations: found, read as the Zoo reads them, and handed to whom they concern."""
+"""Configurations: files are found, merged with their base, and read as the Zoo reads them."""
 
 import argparse
 import pickle
+import shutil
 from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
 import torch as th
 import yaml
 from fake_drive import CONFIG, ENV_ID
 from gymnasium.wrappers import RecordEpisodeStatistics, TimeLimit
+from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.monitor import Monitor
+from stable_baselines3.common.noise import ActionNoise, NormalActionNoise, OrnsteinUhlenbeckActionNoise
+from stable_baselines3.common.vec_env import VecExtractDictObs, VecFrameStack, VecNormalize
 
-from sb3_have import ModalityReplayBuffer, MultiModalPolicy, train
+from sb3_have import ModalityReplayBuffer, MultiModalPolicy, configuration, train
 from sb3_have.common.encoders import ImageEncoder
 from sb3_have.configuration import (
+    algorithm_of,
+    config_names,
     config_path,
     env_wrapper,
     hyperparameter,
     load_config,
     model_kwargs,
+    normalize_kwargs,
 )
 from sb3_have.envs.drivers import RandomDriver
 from sb3_have.evaluation.evaluation import evaluate_episodes
 from sb3_have.have.auxiliary import DeepMDP
 from sb3_have.train import Run
 
-#: Ends every episode after two steps.
+STOP = "stable_baselines3.common.callbacks.StopTrainingOnMaxEpisodes"
+# Ends every episode after two steps
 SHORT = {"gymnasium.wrappers.TimeLimit": {"max_episode_steps": 2}}
 
 
-def test_unknown_configuration_is_explained(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError, match=r"nothing.*zoo_configs"):
-        config_path("nothing")
-    with pytest.raises(KeyError, match=r"Pendulum-v1.*only for HighwayVision-v0, CarlaVision-v0"):
-        load_config("havesac", "Pendulum-v1")
-    (tmp_path / "mine.yml").write_text("A-v0: {gamma: 0.5}")
-    assert load_config(str(tmp_path / "mine.yml"), "A-v0") == {"gamma": 0.5}
-    (tmp_path / "mine.yml").write_text("A-v0: 3")
-    with pytest.raises(ValueError, match=r"mine\.yml: expected ids of environments"):
-        load_config(str(tmp_path / "mine.yml"), "A-v0")
+def write(folder: Path, content: dict[str, Any], name: str = "mine") -> str:
+    path = folder / f"{name}.yml"
+    path.write_text(yaml.safe_dump(content))
+    return str(path)
 
 
-def test_one_block_for_both_simulators() -> None:
-    ours, theirs = load_config("havesac", "CarlaVision-v0"), load_config("havesac", "HighwayVision-v0")
-    assert ours == {**theirs, "env_kwargs": {**theirs["env_kwargs"], "reward": "highway"}}
+def test_configurations_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert load_config(write(tmp_path, {"A-v0": {"gamma": 0.5}}), "A-v0") == {"gamma": 0.5}
+    with pytest.raises(FileNotFoundError, match=r"'heve'; did you mean 'have'.*there are concat, crossq"):
+        config_path("heve")
+    with pytest.raises(KeyError, match=r"Pendulum-v1.*only for HighwayVision-v0, CarlaVision-v0, Reliab"):
+        load_config("have", "Pendulum-v1")
+    with pytest.raises(ValueError, match="expected environment ids"):
+        load_config(write(tmp_path, 3), "A-v0")  # type: ignore[arg-type]
+    # The wheel has them inside the package
+    installed = tmp_path / "sb3_have" / "zoo_configs"
+    shutil.copytree(config_path("have").parent, installed)
+    monkeypatch.setattr(configuration, "__file__", str(tmp_path / "sb3_have" / "configuration.py"))
+    assert config_path("have") == installed / "have.yml" and "shared" not in config_names()
+
+
+def test_ids_with_a_module_find_the_block_of_the_plain_id(tmp_path: Path) -> None:
+    assert load_config("have", "sb3_have:HighwayVision-v0") == load_config("have", "HighwayVision-v0")
+    path = write(tmp_path, {"A-v0": {"gamma": 0.5}, "pkg:A-v0": {"gamma": 0.7}})
+    assert [load_config(path, env_id)["gamma"] for env_id in ("A-v0", "other:A-v0", "pkg:A-v0")] == [0.5, 0.5, 0.7]
+
+
+def test_block_is_merged_into_that_of_the_base(tmp_path: Path) -> None:
+    block = {"tau": 0.1, "env_kwargs": {"size": 8, "weather": "sun"}, "policy_kwargs": {"net_arch": [8]}}
+    write(tmp_path, {"algo": "sac", "A-v0": block, "B-v0": {}}, "first")
+    own = {"gamma": 0.5, "env_kwargs": {"size": 9}, "policy_kwargs": {"n_critics": 1}}
+    path = write(tmp_path, {"base": "first.yml", "A-v0": own}, "second")
+    merged = {**own, "tau": 0.1, "env_kwargs": {"size": 9, "weather": "sun"}}
+    assert load_config(path, "A-v0") == merged and algorithm_of(path) == "sac"
+    with pytest.raises(KeyError, match="no block for 'B-v0', only for A-v0"):
+        load_config(path, "B-v0")
+    # CrossQ has no target network
+    third = write(tmp_path, {"algo": "crossq", "base": "second.yml", "A-v0": {}}, "third")
+    assert load_config(third, "A-v0") == {key: value for key, value in merged.items() if key != "tau"}
+    assert load_config(write(tmp_path, {"base": "lve", "HighwayVision-v0": {}}), "HighwayVision-v0") == load_config(
+        "lve", "HighwayVision-v0"
+    )
+
+
+def test_file_names_its_algorithm(tmp_path: Path) -> None:
+    """The name of the file does not decide."""
+    assert algorithm_of(write(tmp_path, {"A-v0": {}}, "tqc")) == "havesac"
+    assert algorithm_of(write(tmp_path, {"algo": "tqc", "A-v0": {}}, "my_tqc")) == "tqc"
+    assert {name: algorithm_of(name) for name in config_names() if algorithm_of(name) != "havesac"} == {
+        "tqc": "tqc",
+        "crossq": "crossq",
+    }
+    with pytest.raises(ValueError, match=r"mine\.yml: there is no algo 'tcq'.*there are crossq, havesac"):
+        algorithm_of(write(tmp_path, {"algo": "tcq"}))
+
+
+def test_merged_file_is_printed_for_the_zoo(capsys: pytest.CaptureFixture[str]) -> None:
+    configuration.main(["drq"])
+    printed = yaml.safe_load(capsys.readouterr().out)
+    assert printed == {"algo": "havesac", "HighwayVision-v0": load_config("drq", "HighwayVision-v0")}
+
+
+def test_unknown_keys_are_refused_before_anything_starts(tmp_path: Path) -> None:
+    path = write(tmp_path, {ENV_ID: {**CONFIG, "bufer_size": 3}})
+    arguments = ["--config", path, "--env", ENV_ID, "--out", str(tmp_path / "run")]
+    with pytest.raises(ValueError, match="havesac has no hyper-parameter 'bufer_size'; did you mean 'buffer_size'"):
+        train.main(arguments)
+    arguments += ["--hyperparams", "refusion:free"]
+    with pytest.raises(ValueError, match="sac has no hyper-parameter 'refusion'"):
+        train.main([*arguments, "--config", write(tmp_path, {ENV_ID: CONFIG}), "--algo", "sac"])
+    assert not (tmp_path / "run").exists()
 
 
 def test_evaluation_has_keywords_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -109,10 +174,93 @@ def test_dotted_paths_become_classes() -> None:
     }
 
 
-@pytest.mark.parametrize("path", ["sb3_have.Nothing", "no_such_module.Buffer", "ModalityReplayBuffer"])
+@pytest.mark.parametrize("path", ["sb3_have.Nothing", "no_such_module.Buffer"])
 def test_wrong_dotted_paths_are_explained(path: str) -> None:
     with pytest.raises(ValueError, match=f"no replay_buffer_class '{path}'"):
         model_kwargs({"replay_buffer_class": path})
+
+
+def test_values_of_the_zoo_are_read() -> None:
+    config = {
+        "policy_kwargs": "dict(net_arch=[8], activation_fn=nn.Tanh)",
+        "replay_buffer_class": "HerReplayBuffer",
+        "replay_buffer_kwargs": "{'n_sampled_goal': 4.0}",
+        "train_freq": [1, "episode"],
+        "buffer_size": 1e6,
+        "gradient_steps": -1,
+    }
+    assert model_kwargs(config) == {
+        "policy_kwargs": {"net_arch": [8], "activation_fn": th.nn.Tanh},
+        "replay_buffer_class": HerReplayBuffer,
+        "replay_buffer_kwargs": {"n_sampled_goal": 4.0},
+        "train_freq": (1, "episode"),
+        "buffer_size": 1_000_000,
+        "gradient_steps": -1,
+    }
+    assert isinstance(model_kwargs(config)["buffer_size"], int)
+    with pytest.raises(ValueError, match=r"policy_kwargs: 'dict.net_arch=nothing.' is not Python: NameError"):
+        model_kwargs({"policy_kwargs": "dict(net_arch=nothing)"})
+
+
+@pytest.mark.parametrize(
+    ("normalize", "expected"),
+    [
+        (False, None),
+        (True, {"gamma": 0.9}),
+        ({"norm_obs": False}, {"norm_obs": False, "gamma": 0.9}),
+        ("dict(norm_obs=False)", {"norm_obs": False, "gamma": 0.9}),
+    ],
+)
+def test_normalize(normalize: Any, expected: dict[str, Any] | None) -> None:
+    """VecNormalize discounts rewards as the algorithm does."""
+    assert normalize_kwargs({"normalize": normalize, "gamma": 0.9}) == expected
+
+
+def test_training_env_is_wrapped_as_in_the_zoo(tmp_path: Path) -> None:
+    config = {
+        "env_kwargs": {"max_episode_steps": 3},
+        "monitor_kwargs": "dict(info_keywords=('speed',))",
+        "vec_env_wrapper": {"stable_baselines3.common.vec_env.VecExtractDictObs": {"key": "m1"}},
+        "normalize": {"norm_reward": False},
+        "gamma": 0.9,
+        "frame_stack": 2,
+    }
+    env: Any = train.make_training_env("ReliabilityDrive-v0", config, tmp_path)
+    layers = []
+    while hasattr(env, "venv"):
+        layers.append(env)
+        env = env.venv
+    assert [type(layer) for layer in layers] == [VecFrameStack, VecNormalize, VecExtractDictObs]
+    assert (layers[1].norm_reward, layers[1].gamma) == (False, 0.9)
+    env.reset()
+    for _ in range(3):
+        env.step(np.array([env.action_space.sample()]))
+    assert (tmp_path / "monitor.csv").read_text().splitlines()[1] == "r,l,t,distance,speed"
+    env.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "noise"), [("normal", NormalActionNoise), ("ornstein-uhlenbeck", OrnsteinUhlenbeckActionNoise)]
+)
+def test_action_noise(name: str, noise: type[ActionNoise]) -> None:
+    env = train.make_training_env("ReliabilityDrive-v0", {})
+    made = model_kwargs({"noise_type": name, "noise_std": 0.5}, env)["action_noise"]
+    assert type(made) is noise and repr(made).endswith("(mu=[0. 0.], sigma=[0.5 0.5])")
+    with pytest.raises(ValueError, match="noise_type='white': expected"):
+        model_kwargs({"noise_type": "white", "noise_std": 0.5}, env)
+    env.close()
+
+
+def test_noise_and_callbacks_reach_the_training(tmp_path: Path) -> None:
+    config = {
+        **CONFIG,
+        "noise_type": "normal",
+        "noise_std": 0.1,
+        "callback": [{STOP: {"max_episodes": 2}}, f"{STOP}: {{max_episodes: 2}}"],
+    }
+    model = Run(config, ENV_ID, tmp_path, algo="sac", eval_freq=0, device="cpu").train(100)
+    assert isinstance(model.action_noise, NormalActionNoise)
+    assert len((tmp_path / "monitor.csv").read_text().splitlines()) == 4, "training stops after two episodes"
 
 
 @pytest.mark.parametrize(

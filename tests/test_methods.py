@@ -1,32 +1,36 @@
-"""The methods of the comparison: every file of zoo_configs trains, and differs from the others in the method alone."""
+"""The methods of the comparison: every file of zoo_configs trains, and the files differ in the method alone."""
 
+import json
+from collections.abc import Collection
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import torch as th
-import yaml
 from stable_baselines3.common.policies import ContinuousCritic
 from torch import nn
 
 from sb3_have import HAVESAC, ModalityReplayBuffer
+from sb3_have.algorithms import ALGORITHMS, saved_algorithm
+from sb3_have.benchmark.grid import read_grid
 from sb3_have.checkpoint import newest_checkpoint
 from sb3_have.common.encoders import MultiModalExtractor
-from sb3_have.configuration import config_path, load_config, model_kwargs
+from sb3_have.configuration import algorithm_of, config_names, config_path, load_config, model_kwargs
 from sb3_have.evaluation.recording import record_episode
-from sb3_have.train import Run, algorithm_of, algorithms, make_training_env
+from sb3_have.train import Run, make_training_env
 
 ENV_ID = "HighwayVision-v0"
 SENSORS = ["rgb", "event", "depth"]
-GLOBAL = [*SENSORS, "sac", "deepmdp", "gve", "gve-wide", "drq", "transfuser", "efnet"]
+GLOBAL = [*SENSORS, "concat", "deepmdp", "gve", "gve-wide", "drq", "transfuser", "efnet"]
 LOCAL = ["lve", "have", "lve-paper", "have-paper", "have-dropout"]
 METHODS = [*GLOBAL, *LOCAL, "tqc", "crossq"]
-#: What makes a method; everything else is shared.
+# What defines a method; everything else is shared
 ITS_OWN = {
     "value_estimation", "auxiliary", "target", "refusion", "local_coef", "modality_dropout", "random_shift",
-    "n_augmentations", "policy_kwargs",
+    "n_augmentations", "policy", "policy_kwargs",
 }  # fmt: skip
 
 
@@ -42,9 +46,9 @@ def make_run(method: str, out: Path) -> Run:
     return Run(small_config(method), ENV_ID, out, algo=algorithm_of(method), eval_freq=0, save_freq=0, device="cpu")
 
 
-def build(method: str, **env_kwargs: Any) -> HAVESAC:
+def build(method: str, without: Collection[str] = (), **env_kwargs: Any) -> HAVESAC:
     """An untrained model."""
-    config = small_config(method, **env_kwargs)
+    config = {key: value for key, value in small_config(method, **env_kwargs).items() if key not in without}
     env = make_training_env(ENV_ID, config)
     env.close()
     return HAVESAC(env=env, seed=0, device="cpu", **model_kwargs(config))
@@ -62,18 +66,21 @@ def heads(method: str, modalities: tuple[str, ...] = ("rgb", "event"), **policy_
 
 
 def test_every_file_is_a_method() -> None:
-    names = {path.stem for path in config_path("havesac").parent.glob("*.yml")}
-    assert names == {*METHODS, "havesac"}
-    assert all(ENV_ID in yaml.safe_load(config_path(name).read_text()) for name in METHODS)
+    assert set(config_names()) == {*METHODS, "have-50k"}
+    assert all(load_config(name, ENV_ID)["policy"] for name in METHODS)
 
 
-def test_algorithm_follows_from_the_name() -> None:
-    assert {name: algorithm_of(name) for name in METHODS if algorithm_of(name) != "havesac"} == {
-        "tqc": "tqc",
-        "crossq": "crossq",
-    }
-    assert algorithm_of("zoo_configs/tqc.yml") == "tqc" and algorithm_of("tqc_of_mine.yml") == "havesac"
-    assert {algorithm_of(name) for name in METHODS} < set(algorithms())
+def test_committed_results_are_those_of_the_configurations() -> None:
+    """So the runs of the core grid count as finished, under the names that they had."""
+    benchmarks = Path(__file__).parents[1] / "benchmarks"
+    runs = pd.read_csv(benchmarks / "results" / "core" / "runs.csv")
+    jobs = {(job.method, job.seed): job for job in read_grid(benchmarks / "grids" / "core.yml").jobs()}
+    assert len(runs) == len(jobs) == 21
+    for row in runs.itertuples():
+        recorded = json.loads(str(row.settings))
+        settings = jobs[str(row.method), int(str(row.seed))].settings
+        assert {key: recorded[key] for key in settings} == settings
+        assert set(recorded) - set(settings) == {"final_episodes", "failures"}
 
 
 @pytest.mark.parametrize("method", METHODS)
@@ -94,15 +101,16 @@ def test_what_the_methods_are() -> None:
         method: {key: value for key, value in load_config(method, ENV_ID).items() if key in ITS_OWN}
         for method in METHODS
     }
-    assert own["deepmdp"] == own["gve"] == {"value_estimation": "gve", "auxiliary": "deepmdp"}
-    assert own["sac"] == {**own["deepmdp"], "auxiliary": None}
+    policy = {"policy": "MultiInputPolicy"}
+    assert own["deepmdp"] == own["gve"] == {"value_estimation": "gve", "auxiliary": "deepmdp", **policy}
+    assert own["concat"] == {**own["deepmdp"], "auxiliary": None}
     assert all(own[sensor] == own["deepmdp"] for sensor in SENSORS)
-    assert own["drq"] == {**own["sac"], "random_shift": 4, "n_augmentations": 2}
+    assert own["drq"] == {**own["concat"], "random_shift": 4, "n_augmentations": 2}
     for fusion in ("transfuser", "efnet"):
         assert own[fusion] == {**own["deepmdp"], "policy_kwargs": {"fusion": fusion}}
     assert own["have-dropout"] == {**own["have"], "modality_dropout": 0.2}
-    assert own["tqc"] == own["crossq"]
-    default, written = build("havesac", modalities=["rgb", "event"]), build("have")
+    assert set(own["tqc"]) == set(own["crossq"]) == {"policy"}
+    default, written = build("have", without=ITS_OWN - {"policy"}), build("have")
     for name in ("target", "local_coef", "modality_dropout", "auxiliary_coefs", "policy_kwargs"):
         assert getattr(default, name) == getattr(written, name), name
     paper = build("have-paper")
@@ -150,7 +158,8 @@ def test_method_trains_and_comes_back(method: str, tmp_path: Path) -> None:
     actions, _ = model.predict(observations, deterministic=True)
     assert actions.shape == (16, 2) and np.isfinite(actions).all()
     assert (np.abs(actions) <= 1).all() and actions.std(axis=0).min() > 0
-    loaded = algorithms()[algorithm_of(method)].load(tmp_path / "model.zip", device="cpu")
+    assert saved_algorithm(tmp_path / "model.zip", method) == algorithm_of(method)
+    loaded = ALGORITHMS[algorithm_of(method)].load(tmp_path / "model.zip", device="cpu")
     np.testing.assert_array_equal(loaded.predict(observations, deterministic=True)[0], actions)
 
 

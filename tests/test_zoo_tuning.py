@@ -7,14 +7,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 import zoo_fixtures
 from zoo_fixtures import SMALL, VECTORS, saved
 
 from sb3_have import HAVESAC, tuning, zoo
-from sb3_have.common.encoders import MultiModalExtractor
-from sb3_have.configuration import config_names, config_path, load_config, model_kwargs
-from sb3_have.train import algorithm_of, make_training_env
+from sb3_have.common.tqc import MultiModalTQCPolicy
+from sb3_have.configuration import algorithm_of, config_names, load_config, model_kwargs, read_config
+from sb3_have.train import make_training_env
 from sb3_have.tuning import convert_havesac_params, sample_havesac_params
 
 zoo_patches = zoo_fixtures.zoo_patches
@@ -29,13 +28,9 @@ NOT_DRAWN = {
     "lve": {"refusion"},
     "have-paper": {"local_coef", "refusion"},
     "lve-paper": {"local_coef", "refusion"},
-    **{name: {"local_coef", "refusion"} for name in ("sac", "deepmdp", "gve-wide")},
+    **{name: {"local_coef", "refusion"} for name in ("concat", "deepmdp", "gve-wide")},
 }
-METHODS = [
-    name
-    for name in config_names()
-    if algorithm_of(name) == "havesac" and VECTORS in yaml.safe_load(config_path(name).read_text())
-]
+METHODS = [name for name in config_names() if algorithm_of(name) == "havesac" and VECTORS in read_config(name)]
 #: A search of seconds.
 SEARCH = ["--env", VECTORS, "-n", "120", "--n-evaluations", "1", "--eval-episodes", "1", "--no-optim-plots"]
 SEARCH += ["--device", "cpu", "--pruner", "none"]
@@ -77,7 +72,7 @@ def test_what_makes_a_method_is_not_drawn(name: str) -> None:
     env = make_training_env(VECTORS, config)
     for _ in range(3):
         trial = study.ask()
-        sampled = sample_havesac_params(trial, 2, 1, {}, config)
+        sampled = sample_havesac_params(trial, 2, 1, {"hyperparams": config})
         assert set(trial.params) == set(DRAWN) - NOT_DRAWN.get(name, set())
         assert convert_havesac_params(trial.params) == sampled
         model = HAVESAC(env=env, device="cpu", **{**model_kwargs(config), **sampled})
@@ -87,7 +82,7 @@ def test_what_makes_a_method_is_not_drawn(name: str) -> None:
 
 
 def test_search_keeps_policy_kwargs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of the configuration or the command line, under the drawn ones; then a trial is trained."""
+    """A search merges those of the configuration with the sampled ones, and so does the training of a trial."""
     built: list[dict[str, Any]] = []
 
     class Recorded(HAVESAC):
@@ -109,7 +104,9 @@ def test_search_keeps_policy_kwargs(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert kwargs["policy_kwargs"]["activation_fn"].__name__ == "Tanh"
         assert kwargs["value_estimation"] == "lve" and kwargs["buffer_size"] == 300
         assert (kwargs["gamma"], kwargs["batch_size"]) == (drawn["gamma"], drawn["batch_size"])
-    assert len(list((tmp_path / "havesac").glob("report_*.csv"))) == 1
+    (report,) = (tmp_path / "havesac").glob("*.csv")
+    assert report.name.startswith("report_")
+    assert not list((tmp_path / "havesac").glob(f"{VECTORS}_*")), "a search leaves no folder that enjoy would open"
 
     for number, trial in enumerate(trials):  # the Zoo takes 0 for none
         built.clear()
@@ -124,9 +121,7 @@ def test_search_keeps_policy_kwargs(tmp_path: Path, monkeypatch: pytest.MonkeyPa
         assert (kwargs["gamma"], kwargs["local_coef"]) == (drawn["gamma"], drawn["local_coef"])
         assert (kwargs["tau"], kwargs["buffer_size"]) == (0.5, 40)
         assert saved(folder, "args.yml")["study_name"] == f"lve-{VECTORS}"
-    for unknown in (["--trial-id", "2"], ["--trial-id", "0", "--study-name", "another"]):
-        with pytest.raises(ValueError, match=rf"--trial-id {unknown[1]}: .*optuna.log has no such trial of a study"):
-            zoo.zoo_arguments("train", [*given, "--env", VECTORS, *unknown])
+        assert saved(folder, "config.yml")["gamma"] == drawn["gamma"]
 
 
 def test_search_for_tqc_keeps_the_encoders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -137,14 +132,15 @@ def test_search_for_tqc_keeps_the_encoders(tmp_path: Path, monkeypatch: pytest.M
 
     class Recorded(TQC):
         def __init__(self, *args: Any, **kwargs: Any):
-            built.append(kwargs["policy_kwargs"])
+            built.append(kwargs)
             super().__init__(*args, **kwargs)
 
     monkeypatch.setitem(rl_zoo3.ALGOS, "tqc", Recorded)
     zoo.main(["tune", "--method", "tqc", "-f", str(tmp_path), *SEARCH, "--n-trials", "1", "-params", *SMALL])
-    (policy_kwargs,) = built
-    assert policy_kwargs["features_extractor_class"] is MultiModalExtractor
-    assert {"net_arch", "n_quantiles"} <= set(policy_kwargs)
+    (kwargs,) = built
+    assert kwargs["policy"] is MultiModalTQCPolicy
+    assert kwargs["policy_kwargs"]["features_extractor_kwargs"] == {"features_dim": 32}
+    assert {"net_arch", "n_quantiles"} <= set(kwargs["policy_kwargs"])
 
 
 def test_defaults_of_a_search() -> None:
@@ -169,6 +165,6 @@ def test_two_processes_share_a_study(tmp_path: Path) -> None:
     processes = [subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT) for _ in range(2)]
     printed = [process.communicate()[0].decode() for process in processes]
     assert [process.returncode for process in processes] == [0, 0], "\n".join(printed)
-    trials = study_of(tmp_path, f"havesac-{VECTORS}").trials
+    trials = study_of(tmp_path, f"have-{VECTORS}").trials
     assert sorted(trial.number for trial in trials) == [0, 1, 2, 3]
     assert all(trial.state.is_finished() for trial in trials)

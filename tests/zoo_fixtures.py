@@ -1,4 +1,4 @@
-"""What the tests of ``sb3_have.zoo`` share."""
+"""Fixtures and helpers for the tests of ``sb3_have.zoo``."""
 
 from pathlib import Path
 from typing import Any

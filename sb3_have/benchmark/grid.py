@@ -4,7 +4,7 @@ A grid is a YAML file; only ``methods`` and ``seeds`` are required::
 
     env: HighwayVision-v0
     steps: 30000
-    methods: [sac, lve, have]      # from zoo_configs, or files relative to the grid's; a method is named after its file
+    methods: [gve, lve, have]      # from zoo_configs, or files relative to the grid's; a method is named after its file
     seeds: [0, 1, 2]               # runs are ordered by seed, then by method
     weathers: [ClearNoon, ...]     # default: all eight
     hyperparams: {env_kwargs: {vehicles_count: 20}, batch_size: 64}
@@ -25,7 +25,6 @@ because those make it that method. For the same reason ``modalities`` is a key o
 
 from __future__ import annotations
 
-import inspect
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -39,16 +38,14 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, field_validator, model_validator
 
 from sb3_have.benchmark.reading import method_name
-from sb3_have.configuration import config_names, load_config
+from sb3_have.configuration import algorithm_of, config_names, config_path, known_keys, load_config
 from sb3_have.envs.weather import WEATHERS
 from sb3_have.sensors import SENSORS, failures_for
-from sb3_have.train import algorithm_of, algorithms
 
 # Seed of the episodes after training, the same for all methods and seeds. No run is trained on these episodes or
 # selected by them (:data:`sb3_have.evaluation.callback.EVALUATION_SEED`).
 FINAL_SEED = 2_000_000
 
-NOT_OF_THE_MODEL = {"n_envs", "frame_stack", "env_kwargs", "env_wrapper"}
 OWN_ENVS = ("HighwayVision-v0", "CarlaVision-v0")
 
 
@@ -163,30 +160,35 @@ class Grid(BaseModel):
         :param only: Methods to keep; all if empty
         :raises GridError: If the grid lacks one of ``only``, or a method's configuration does not fit
         """
-        configs = {method_name(method): self._config(method) for method in self.methods}
+        files = {method_name(method): self._file(method) for method in self.methods}
+        configs = {name: self._config(name, file) for name, file in files.items()}
         try:
             _known(only, configs, "--only: ")
         except ValueError as error:
             raise GridError(str(error)) from None
         kept = [name for name in configs if not only or name in only]
-        return [Job(self, name, seed, algorithm_of(name), configs[name]) for seed in self.seeds for name in kept]
+        return [Job(self, name, seed, algorithm_of(files[name]), configs[name]) for seed in self.seeds for name in kept]
 
-    def _config(self, method: str) -> dict[str, Any]:
-        """Return the hyper-parameters of a method, merged with the grid's."""
+    def _file(self, method: str) -> Path:
+        """Find the configuration of a method: a file beside the grid, or a name in ``zoo_configs``."""
         beside = self._path.parent / method
         try:
-            own = load_config(str(beside if beside.is_file() else method), self.env)
+            return beside if beside.is_file() else config_path(method)
         except FileNotFoundError as error:
             raise GridError(f"methods: {error}{_suggestion(method, config_names())}") from None
+
+    def _config(self, name: str, file: Path) -> dict[str, Any]:
+        """Return the hyper-parameters of a method, merged with the grid's."""
+        try:
+            own = load_config(str(file), self.env)
         except KeyError as error:
             raise GridError(f"methods: {error.args[0]}") from None
         config = merge(own, self.hyperparams)
         if self.modalities and len(config.get("env_kwargs", {}).get("modalities", self.modalities)) > 1:
             config["env_kwargs"] = {**config.get("env_kwargs", {}), "modalities": [*self.modalities]}
-        algo = algorithm_of(method_name(method))
-        parameters = {*inspect.signature(algorithms()[algo]).parameters, *NOT_OF_THE_MODEL}
+        algo = algorithm_of(file)
         try:
-            _known(config, parameters, f"hyperparams of {method_name(method)} ({algo}): ")
+            _known(config, known_keys(algo), f"hyperparams of {name} ({algo}): ")
         except ValueError as error:
             raise GridError(str(error)) from None
         return config
@@ -199,7 +201,7 @@ class Job:
     :param grid: The grid
     :param method: Name of the method
     :param seed: Seed of the training
-    :param algo: Name of the algorithm in :func:`sb3_have.train.algorithms`
+    :param algo: Name of the algorithm in :data:`sb3_have.algorithms.ALGORITHMS`
     :param config: The method's hyper-parameters, merged with the grid's
     """
 

@@ -24,6 +24,7 @@ from stable_baselines3.common.monitor import LoadMonitorResultsError, load_resul
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_have import HAVESAC
+from sb3_have.algorithms import ALGORITHMS
 from sb3_have.benchmark.grid import Failures, Job
 from sb3_have.benchmark.provenance import machine
 from sb3_have.benchmark.reading import FILES
@@ -34,7 +35,7 @@ from sb3_have.evaluation.episodes import Env, Step, Task
 from sb3_have.evaluation.evaluation import drive_tasks, episode_tasks, summarize
 from sb3_have.evaluation.recording import weighing
 from sb3_have.sensors import SENSORS, SensorFailure, failures_for
-from sb3_have.train import Run, algorithms
+from sb3_have.train import Run
 
 # Decimals in the results
 DIGITS = 4
@@ -122,7 +123,7 @@ def _rollout_length(config: dict[str, Any]) -> float:
 def _load(job: Job, folder: Path, record: dict[str, Any], device: str) -> OffPolicyAlgorithm:
     if differences := difference(record["settings"], job.settings):
         raise ValueError(f"{folder} is a run with other settings ({differences}); choose another --runs, or remove it")
-    model = algorithms()[job.algo].load(folder / "model.zip", device=device)
+    model = ALGORITHMS[job.algo].load(folder / "model.zip", device=device)
     if model.num_timesteps != record["steps"]:
         raise ValueError(
             f"{folder / 'model.zip'} has been trained on to step {model.num_timesteps}, from the {record['steps']} "

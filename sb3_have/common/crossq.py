@@ -12,6 +12,8 @@ from stable_baselines3.common.torch_layers import CombinedExtractor
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
+from sb3_have.common.encoders import MultiModalExtractor
+
 
 class MultiInputPolicy(CrossQPolicy):
     """CrossQPolicy with a features extractor for Dict observations by default; its parameters are the same."""
@@ -21,16 +23,21 @@ class MultiInputPolicy(CrossQPolicy):
         super().__init__(*args, **kwargs)
 
 
+class MultiModalCrossQPolicy(CrossQPolicy):
+    """CrossQPolicy with :class:`~sb3_have.common.encoders.MultiModalExtractor` as the default features extractor."""
+
+    def __init__(self, *args: Any, **kwargs: Any):
+        kwargs = {"features_extractor_class": MultiModalExtractor, "normalize_images": False, **kwargs}
+        super().__init__(*args, **kwargs)
+
+
 class MultiInputCrossQ(CrossQ):
     """
     CrossQ (Bhatt et al. 2024) with a ``"MultiInputPolicy"``; the algorithm is sb3-contrib's, unchanged.
 
     For the joint batch statistics, its training step concatenates observations and next observations by ``torch.cat``.
     Here they are dictionaries that ``torch.cat`` concatenates key by key. The default features extractor is SB3's
-    ``CombinedExtractor``. To use the encoders of HAVESAC::
-
-        MultiInputCrossQ("MultiInputPolicy", env,
-                         policy_kwargs=dict(features_extractor_class=MultiModalExtractor, normalize_images=False))
+    ``CombinedExtractor``; :class:`MultiModalCrossQPolicy` uses the encoders of HAVESAC.
     """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {

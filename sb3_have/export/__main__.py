@@ -18,11 +18,10 @@ from pathlib import Path
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 
-from sb3_have.checkpoint.saved_algorithm import saved_algorithm
+from sb3_have.algorithms import ALGORITHMS, saved_algorithm
 from sb3_have.export.config import NORMALIZED
 from sb3_have.export.onnx import export_onnx
 from sb3_have.export.safetensors import export_safetensors, load_policy, read_config
-from sb3_have.train import algorithms
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -33,7 +32,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("model", type=Path, metavar="MODEL", help="zip of model.save (trusted!) or exported folder")
     parser.add_argument("--format", choices=["onnx", "safetensors"], required=True)
     parser.add_argument("--out", type=Path, help="file (onnx) or folder (safetensors); default: named after MODEL")
-    parser.add_argument("--algo", choices=list(algorithms()), help="algorithm of a zip; default: found by its policy")
+    parser.add_argument("--algo", choices=list(ALGORITHMS), help="algorithm of a zip; default: found by its policy")
     args = parser.parse_args(arguments)
     source: Path = args.model
     out: Path = args.out or source.with_name(source.stem + (".onnx" if args.format == "onnx" else "_safetensors"))
@@ -66,7 +65,7 @@ def load_zip(path: Path, algo: str | None = None) -> BaseAlgorithm:
     name = algo or known or "havesac"
     if known not in (None, name):
         raise ValueError(f"{path} was saved by {known}, not by {name}: leave out --algo")
-    model = algorithms()[name].load(path, device="cpu", buffer_size=1)
+    model = ALGORITHMS[name].load(path, device="cpu", buffer_size=1)
     # A zip does not say whether the model was trained under VecNormalize; SB3 and the Zoo save the statistics nearby
     for file in sorted([*path.parent.glob("*vecnormalize*.pkl"), *path.parent.glob("*/*vecnormalize*.pkl")]):
         print(f"{file}: if the model was trained under VecNormalize, {NORMALIZED}", file=sys.stderr)

@@ -32,6 +32,7 @@ from sb3_have.common import crossq
 from sb3_have.common.buffers import stacked_frames
 from sb3_have.common.encoders import ImageEncoder, MultiModalExtractor, VectorEncoder
 from sb3_have.common.fusion import CrossModalChannelAttention, Transfuser
+from sb3_have.common.tqc import MultiModalTQCPolicy
 from sb3_have.have.auxiliary import DeepMDP
 from sb3_have.have.have import HAVESAC
 from sb3_have.have.policies import MultiModalPolicy
@@ -45,7 +46,8 @@ CLASSES: dict[str, type[Any]] = {
     for package, kinds in {
         "sb3_have": (MultiModalPolicy, DeepMDP, Transfuser, CrossModalChannelAttention),
         "sb3_have.encoders": (ImageEncoder, VectorEncoder, MultiModalExtractor),
-        "sb3_have.crossq": (crossq.MultiInputPolicy,),
+        "sb3_have.crossq": (crossq.MultiInputPolicy, crossq.MultiModalCrossQPolicy),
+        "sb3_have.tqc": (MultiModalTQCPolicy,),
         "sb3_contrib.crossq": (CrossQPolicy,),
         "sb3_contrib.tqc": (tqc.TQCPolicy, tqc.CnnPolicy, tqc.MultiInputPolicy),
         "stable_baselines3.sac": (sac.SACPolicy, sac.CnnPolicy, sac.MultiInputPolicy),
