@@ -33,7 +33,8 @@ POLICY_MODULES = {
 
 
 def saved_algorithm(model: str | PathLike[str] | IO[bytes], name: object) -> str | None:
-    """Return the name of the algorithm that saved a model, without unpickling anything.
+    """
+    Return the name of the algorithm that saved a model, without unpickling anything.
 
     :param model: Zip file written by ``model.save``
     :param name: Name of the file in error messages

@@ -67,7 +67,8 @@ INTEGERS = ("buffer_size", "learning_starts", "batch_size", "train_freq", "gradi
 
 
 def config_path(name: str | Path) -> Path:
-    """Find the file of a configuration.
+    """
+    Find the file of a configuration.
 
     :param name: Path of a file, or name of a configuration in ``zoo_configs`` ("have")
     :raises FileNotFoundError: If there is neither
@@ -95,7 +96,8 @@ def _suggest(word: str, known: Iterable[str]) -> str:
 
 
 def read_config(name: str | Path) -> dict[str, Any]:
-    """Read a whole file, without its base.
+    """
+    Read a whole file, without its base.
 
     :raises ValueError: If it is not a mapping
     """
@@ -108,7 +110,8 @@ def read_config(name: str | Path) -> dict[str, Any]:
 
 
 def load_config(name: str | Path, env_id: str) -> dict[str, Any]:
-    """Read the hyper-parameters for an environment.
+    """
+    Read the hyper-parameters for an environment.
 
     :param name: See :func:`config_path`
     :param env_id: Environment id; a module prefix ("my_package:MyEnv-v0") may be missing in the file
@@ -132,7 +135,8 @@ def load_config(name: str | Path, env_id: str) -> dict[str, Any]:
 
 
 def algorithm_of(name: str | Path) -> str:
-    """Return the name of the algorithm that a configuration is for.
+    """
+    Return the name of the algorithm that a configuration is for.
 
     :param name: See :func:`config_path`
     :raises ValueError: If there is no such algorithm
@@ -158,7 +162,8 @@ def known_keys(algo: str) -> set[str]:
 
 
 def check_keys(config: Mapping[str, Any], algo: str) -> None:
-    """Check that every key of a configuration is one of the Zoo's or a hyper-parameter of the algorithm.
+    """
+    Check that every key of a configuration is one of the Zoo's or a hyper-parameter of the algorithm.
 
     :raises ValueError: If one is not
     """
@@ -173,7 +178,8 @@ def evaluation_env_kwargs(config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def model_kwargs(config: Mapping[str, Any], env: VecEnv | None = None) -> dict[str, Any]:
-    """Return the arguments of the algorithm's constructor.
+    """
+    Return the arguments of the algorithm's constructor.
 
     The strings of a configuration become objects: ``learning_rate: lin_1e-3`` a schedule that decays linearly from 1e-3
     to 0, ``noise_type`` an action noise, and dotted paths classes. The latter may stand under ``policy``,
@@ -262,7 +268,8 @@ def normalize_kwargs(config: Mapping[str, Any]) -> dict[str, Any] | None:
 
 
 def env_wrapper(config: Mapping[str, Any]) -> Callable[[Env], Env] | None:
-    """Return the ``env_wrapper`` of a configuration as one function, or None.
+    """
+    Return the ``env_wrapper`` of a configuration as one function, or None.
 
     As in the Zoo it is a dotted path, a mapping of a dotted path to keywords, or a list of these, innermost first::
 

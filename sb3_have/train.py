@@ -1,4 +1,5 @@
-"""Train by a configuration of ``zoo_configs``: a run that can be stopped and resumed at any moment.
+"""
+Train by a configuration of ``zoo_configs``: a run that can be stopped and resumed at any moment.
 
     python -m sb3_have.train --config have --env HighwayVision-v0 --steps 200000 --seed 0 --out runs/have-0
 
@@ -63,7 +64,8 @@ VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {"dummy": DummyVe
 
 
 def make_training_env(env_id: str, config: Mapping[str, Any], out: Path | None = None) -> VecEnv:
-    """Make the environments of a configuration, wrapped as the Zoo wraps them.
+    """
+    Make the environments of a configuration, wrapped as the Zoo wraps them.
 
     :param env_id: Environment id
     :param config: Hyper-parameters; several environments (``n_envs``) run in processes of their own
@@ -95,7 +97,8 @@ def make_training_env(env_id: str, config: Mapping[str, Any], out: Path | None =
 
 
 class Run:
-    """One training run in a folder, which resumes where it was stopped or killed.
+    """
+    One training run in a folder, which resumes where it was stopped or killed.
 
     :param config: hyper-parameters, see :func:`load_config`
     :param env_id: Id of the environment
@@ -151,7 +154,8 @@ class Run:
         self.seconds, self.interrupted = 0.0, False
 
     def train(self, steps: int, progress_bar: bool = False, keep_checkpoint: bool = True) -> OffPolicyAlgorithm:
-        """Train up to a number of steps, from the newest checkpoint if there is one.
+        """
+        Train up to a number of steps, from the newest checkpoint if there is one.
 
         :param steps: Training steps over all sessions
         :param progress_bar: Whether to show SB3's progress bar, and one for each evaluation

@@ -17,7 +17,8 @@ BATCH_SIZE = (5, 8)
 def sample_havesac_params(
     trial: optuna.Trial, n_actions: int, n_envs: int, additional_args: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Sample HAVESAC's hyper-parameters.
+    """
+    Sample HAVESAC's hyper-parameters.
 
     ``gradient_steps`` stays as configured: ``train_freq`` alone decides how many steps there are per update. Parameters
     that define a method are not sampled: the re-fusion and ``local_coef`` if its critic has none, or if

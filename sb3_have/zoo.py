@@ -1,4 +1,5 @@
-"""The RL Zoo with HAVESAC in it: train, watch, and search for hyper-parameters.
+"""
+The RL Zoo with HAVESAC in it: train, watch, and search for hyper-parameters.
 
     python -m sb3_have.zoo train -conf have --env HighwayVision-v0 -P
     python -m sb3_have.zoo enjoy --algo havesac --env HighwayVision-v0
@@ -31,11 +32,11 @@ import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 from stable_baselines3.common.vec_env import VecEnv
 
-from sb3_have import HAVESAC
 from sb3_have.common.buffers import ModalityReplayBuffer
 from sb3_have.common.crossq import MultiInputCrossQ
 from sb3_have.common.memory import keep_freed_memory
 from sb3_have.configuration import algorithm_of, config_names, config_path, load_config, model_kwargs, read_config
+from sb3_have.have import HAVESAC
 from sb3_have.tuning import convert_havesac_params, sample_havesac_params
 
 try:
@@ -131,7 +132,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def zoo_arguments(command: str, given: Sequence[str]) -> list[str]:
-    """Complete the arguments of one of the Zoo's commands.
+    """
+    Complete the arguments of one of the Zoo's commands.
 
     The Zoo takes the last of an option that occurs twice, so the defaults come before what the user gave.
 

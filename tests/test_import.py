@@ -1,8 +1,11 @@
 """Importing the package is cheap, and nothing is missing from it."""
 
+import ast
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from importlib import import_module
+from pathlib import Path
 
 import pytest
 
@@ -49,3 +52,40 @@ def test_a_name_that_does_not_exist(module: str) -> None:
 def test_packages_inside_are_attributes() -> None:
     code = "import sb3_have; sb3_have.sensors.EventCamera; sb3_have.plotting; sb3_have.export; sb3_have.have.HAVESAC"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+ROOMS = ("benchmark", "export", "have", "plotting", "evaluation", "checkpoint", "common", "envs", "sensors")
+"""From the top down: a package may only import from those below it. The programs import from all of them."""
+
+
+def imports() -> dict[str, set[str]]:
+    """All imports between the modules of the package, also in functions and for type checkers."""
+    root = Path(sb3_have.__file__).parent
+    files = {".".join(file.relative_to(root.parent).with_suffix("").parts): file for file in root.rglob("*.py")}
+    files = {name.removesuffix(".__init__"): file for name, file in files.items()}
+    graph: dict[str, set[str]] = {}
+    for name, file in files.items():
+        found = graph.setdefault(name, set())
+        for node in ast.walk(ast.parse(file.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                found |= {f"{node.module}.{alias.name}" for alias in node.names} | {node.module}
+            elif isinstance(node, ast.Import):
+                found |= {alias.name for alias in node.names}
+        graph[name] = (found & files.keys()) - {name}
+    return graph
+
+
+def test_no_import_cycles() -> None:
+    # A package imports its modules, which is no reason for them not to import one another
+    graph = {name: {other for other in found if not name.startswith(f"{other}.")} for name, found in imports().items()}
+    assert len(list(TopologicalSorter(graph).static_order())) > 90
+
+
+def test_imports_point_down() -> None:
+    for name, found in imports().items():
+        room = name.split(".")[1] if "." in name else ""
+        if room in ROOMS:
+            programs = () if room == "benchmark" else ("train", "zoo", "demo", "watch")  # it is a program itself
+            above = {*ROOMS[: ROOMS.index(room)], *programs}
+            wrong = [other for other in found if other.split(".")[1:2] and other.split(".")[1] in above]
+            assert not wrong, f"{name} imports {wrong}"

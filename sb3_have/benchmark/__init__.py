@@ -1,4 +1,5 @@
-"""Compare methods: train a grid of methods x seeds, and report tables and figures of the results.
+"""
+Compare methods: train a grid of methods x seeds, and report tables and figures of the results.
 
 What a single run needs does not belong here::
 

@@ -1,4 +1,5 @@
-"""The figures of a benchmark. A method looks the same in all of them, and can be recognised without colour.
+"""
+The figures of a benchmark. A method looks the same in all of them, and can be recognised without colour.
 
 They use matplotlib's ``Figure`` and leave pyplot alone. No text is smaller than 9 points.
 """
@@ -62,7 +63,8 @@ def style(method: str) -> Style:
 
 
 def plot_progress(results: Results, reference: str = "have") -> Figure:
-    """Plot the mean over weathers against training steps, with a column for each measure.
+    """
+    Plot the mean over weathers against training steps, with a column for each measure.
 
     A line is the mean over seeds. The reference alone has a band, from its lowest to its highest seed. Only the seeds
     that are as far as their method's furthest one are used: a mean over different seeds at different steps would jump
@@ -101,7 +103,8 @@ def plot_progress(results: Results, reference: str = "have") -> Figure:
 
 
 def learning_curves(evaluations: pd.DataFrame, method: str) -> pd.DataFrame:
-    """Return the learning curve of each seed that is as far as the method's furthest one.
+    """
+    Return the learning curve of each seed that is as far as the method's furthest one.
 
     :param evaluations: Evaluations of all methods
     :param method: The method
@@ -132,7 +135,8 @@ def _draw_drivers(axis: Axes, drivers: pd.DataFrame, measure: Measure) -> None:
 
 
 def plot_scores(results: Results, reference: str = "have", table: pd.DataFrame | None = None) -> Figure:
-    """Plot the interquartile mean of each method, with its 95% interval if there are enough seeds.
+    """
+    Plot the interquartile mean of each method, with its 95% interval if there are enough seeds.
 
     :param results: Results with finished runs
     :param reference: As for :func:`~sb3_have.benchmark.tables.score_table`
@@ -143,7 +147,8 @@ def plot_scores(results: Results, reference: str = "have", table: pd.DataFrame |
 
 
 def plot_improvement(results: Results, reference: str = "have", table: pd.DataFrame | None = None) -> Figure:
-    """Plot how often the reference beats each other method in the same weather; parameters as for :func:`plot_scores`.
+    """
+    Plot how often the reference beats each other method in the same weather; parameters as for :func:`plot_scores`.
 
     :raises ValueError: If the reference or all other methods have no finished run
     """
@@ -183,7 +188,8 @@ def _plot_intervals(results: Results, table: pd.DataFrame, name: str, methods: l
 
 
 def plot_profiles(results: Results, measure: Measure = DISTANCE, reference: str = "have") -> Figure:
-    """Plot the share of runs, over all weathers, whose mean exceeds a threshold: the higher the line, the better.
+    """
+    Plot the share of runs, over all weathers, whose mean exceeds a threshold: the higher the line, the better.
 
     :param results: Results with finished runs
     :param measure: Measure of the thresholds
@@ -232,7 +238,8 @@ def plot_weather_weights(results: Results) -> Figure:
 
 
 def plot_episode_weights(results: Results, method: str, seed: int) -> Figure:
-    """Plot the weight of each modality over one episode of each weather (the paper's Fig. 5).
+    """
+    Plot the weight of each modality over one episode of each weather (the paper's Fig. 5).
 
     :param results: The results
     :param method: Method with weights
@@ -272,7 +279,8 @@ def plot_episode_weights(results: Results, method: str, seed: int) -> Figure:
 
 
 def plot_failures(table: pd.DataFrame, measure: Measure) -> Figure:
-    """Plot every method under each sensor failure.
+    """
+    Plot every method under each sensor failure.
 
     Each modality has a row, with a group of bars without a failure and one for each kind of failure. Whiskers reach
     from the lowest to the highest seed.

@@ -1,4 +1,5 @@
-"""The grid of a benchmark: which methods and seeds to train, for how long, and how to evaluate them.
+"""
+The grid of a benchmark: which methods and seeds to train, for how long, and how to evaluate them.
 
 A grid is a YAML file; only ``methods`` and ``seeds`` are required::
 
@@ -54,7 +55,8 @@ class GridError(ValueError):
 
 
 class Failures(BaseModel):
-    """Sensor failures for whole episodes after training.
+    """
+    Sensor failures for whole episodes after training.
 
     :param kinds: Kinds of failure, see :data:`sb3_have.sensors.failures.FAILURES`; each on every modality that has it
     :param severity: 1, 2 or 3
@@ -155,7 +157,8 @@ class Grid(BaseModel):
         return self
 
     def jobs(self, only: Iterable[str] = ()) -> list[Job]:
-        """Return the runs in the order of work.
+        """
+        Return the runs in the order of work.
 
         :param only: Methods to keep; all if empty
         :raises GridError: If the grid lacks one of ``only``, or a method's configuration does not fit
@@ -196,7 +199,8 @@ class Grid(BaseModel):
 
 @dataclass(frozen=True)
 class Job:
-    """One run of a grid.
+    """
+    One run of a grid.
 
     :param grid: The grid
     :param method: Name of the method
@@ -226,7 +230,8 @@ class Job:
 
 
 def merge(own: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> dict[str, Any]:
-    """Merge a method's configuration with a grid's ``hyperparams``. ``n_timesteps`` is dropped: the grid has ``steps``.
+    """
+    Merge a method's configuration with a grid's ``hyperparams``. ``n_timesteps`` is dropped: the grid has ``steps``.
 
     :raises GridError: If they change the method's own ``policy_kwargs``
     """
@@ -241,7 +246,8 @@ def merge(own: Mapping[str, Any], hyperparams: Mapping[str, Any]) -> dict[str, A
 
 
 def read_grid(path: Path) -> Grid:
-    """Read and check a grid.
+    """
+    Read and check a grid.
 
     :param path: YAML file, whose name without the ending is the grid's
     :raises GridError: If a key is unknown or missing, or a value is wrong

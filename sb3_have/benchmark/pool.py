@@ -23,7 +23,8 @@ ENVIRONMENT = {
 
 
 class RayPool:
-    """Starts runs, waits for them, and stops them.
+    """
+    Starts runs, waits for them, and stops them.
 
     :param runs: Folder of the runs' folders, shared by all machines
     :param address: Address of a cluster; None starts Ray on this machine until :meth:`close`
@@ -74,7 +75,8 @@ class RayPool:
         return [*self._running.values()]
 
     def wait(self, seconds: float) -> list[tuple[Job, bool | Exception]]:
-        """Wait for a run to end.
+        """
+        Wait for a run to end.
 
         :param seconds: Maximum time to wait
         :return: The runs that ended, each with whether it is finished (False if it was stopped) or its error

@@ -22,7 +22,8 @@ PACKAGES = ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "highway-e
 
 
 def commit_of(folder: Path) -> str | None:
-    """Return the commit of a git checkout, with "-dirty" if tracked files differ from it; None if it is not a checkout.
+    """
+    Return the commit of a git checkout, with "-dirty" if tracked files differ from it; None if it is not a checkout.
 
     :param folder: Top of the checkout
     """
@@ -40,7 +41,8 @@ COMMIT = commit_of(Path(__file__).resolve().parents[2])
 
 
 def machine(device: str = "cpu") -> dict[str, str]:
-    """Return the machine and the versions, as columns of a row.
+    """
+    Return the machine and the versions, as columns of a row.
 
     :param device: Torch device
     :return: ``machine`` and ``versions``, the latter with the package's commit if it is a checkout
@@ -65,7 +67,8 @@ def cpu_model() -> str:
 
 
 def provenance(results: Results, out: Path) -> list[str]:
-    """Write a report's last section: machines, versions, settings, and the commands that reproduce it.
+    """
+    Write a report's last section: machines, versions, settings, and the commands that reproduce it.
 
     :param results: The results
     :param out: Folder of the report

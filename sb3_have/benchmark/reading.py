@@ -89,7 +89,8 @@ RETURN, DISTANCE = Measure("return", "ER", "", 1), Measure("distance", "D", "m",
 
 @dataclass(frozen=True)
 class Results:
-    """The results of a benchmark.
+    """
+    The results of a benchmark.
 
     :param folders: Where they were read from
     :param frames: Data frames by the names of :data:`FILES`, empty for files that do not exist
@@ -180,7 +181,8 @@ def ordered(methods: Iterable[str]) -> list[str]:
 
 
 def read_results(folders: Sequence[Path], grids: Sequence[Path] | None = None) -> Results:
-    """Read and join results folders.
+    """
+    Read and join results folders.
 
     :param folders: Folders of grids with the same settings; no run may be in two of them
     :param grids: Grid files, for the runs that are still missing; default: ``../../grids/<folder>.yml`` of each folder
@@ -225,7 +227,8 @@ def _planned(path: Path) -> list[tuple[str, int]]:
 
 
 def read_csv(path: Path) -> pd.DataFrame:
-    """Read one of :data:`FILES`.
+    """
+    Read one of :data:`FILES`.
 
     :param path: The name decides the layout
     :return: Its rows; the index is ``<path>, line <number>``

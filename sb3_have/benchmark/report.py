@@ -1,4 +1,5 @@
-"""Write the report of a benchmark: ``report.md``, its figures, and its tables as CSV files.
+"""
+Write the report of a benchmark: ``report.md``, its figures, and its tables as CSV files.
 
     python -m sb3_have.benchmark report benchmarks/results/core benchmarks/results/extended --out report
 
@@ -35,7 +36,8 @@ def write_report(
     reference: str = "have",
     grids: Sequence[Path] | None = None,
 ) -> Path:
-    """Read results and write the report.
+    """
+    Read results and write the report.
 
     :param results: Folder or folders
     :param out: Folder of the report; default: ``report`` in the first folder
@@ -49,7 +51,8 @@ def write_report(
 
 
 class Report:
-    """The sections of a report.
+    """
+    The sections of a report.
 
     :param results: The results
     :param out: Folder of the report
@@ -63,7 +66,8 @@ class Report:
         self.measures = results.measures[::-1]
 
     def write(self) -> Path:
-        """Write all sections, and the files that belong to them.
+        """
+        Write all sections, and the files that belong to them.
 
         :return: Path of ``report.md``
         """
@@ -271,7 +275,8 @@ def _episodes_by_step(evaluations: pd.DataFrame) -> str:
 
 
 def _noise(results: Results) -> str:
-    """Describe how much of the learning curves is due to the choice of the episodes.
+    """
+    Describe how much of the learning curves is due to the choice of the episodes.
 
     This is the standard error of a seed's mean over the weathers, from the standard deviations of the final episodes.
     """

@@ -29,7 +29,8 @@ def of_run(rows: pd.DataFrame, job: Job) -> pd.Series[bool]:
 
 
 def merge(results: Path, job: Job, tables: dict[str, pd.DataFrame]) -> None:
-    """Replace the rows of a run in every file.
+    """
+    Replace the rows of a run in every file.
 
     :param results: Results folder
     :param job: The run
@@ -49,7 +50,8 @@ def merge(results: Path, job: Job, tables: dict[str, pd.DataFrame]) -> None:
 
 
 def is_finished(results: Path, job: Job) -> bool:
-    """Return whether the results contain a run with everything that the grid asks for.
+    """
+    Return whether the results contain a run with everything that the grid asks for.
 
     :raises GridError: If they contain it with other settings
     """

@@ -1,4 +1,5 @@
-"""Run a grid of methods x seeds, which can be stopped and resumed at any moment.
+"""
+Run a grid of methods x seeds, which can be stopped and resumed at any moment.
 
     python -m sb3_have.benchmark run benchmarks/grids/core.yml
 
@@ -49,7 +50,8 @@ class Pool(Protocol):
 
 
 class Runner:
-    """Works through the runs of a grid and collects their results.
+    """
+    Works through the runs of a grid and collects their results.
 
     :param jobs: Runs in the order of work
     :param runs: Folder of the runs' folders
@@ -76,7 +78,8 @@ class Runner:
         return not self._todo
 
     def run(self, pool: Pool) -> int:
-        """Work until everything is done, or until a stop.
+        """
+        Work until everything is done, or until a stop.
 
         :return: Exit code: 0 if every run is finished, 1 if one failed, 3 if stopped before the end
         """

@@ -1,4 +1,5 @@
-"""One run of a benchmark: train, drive the final episodes in each weather, and drive them again with failing sensors.
+"""
+One run of a benchmark: train, drive the final episodes in each weather, and drive them again with failing sensors.
 
 Each stage leaves complete files in the run's folder, so that a run that dies resumes where it was:
 
@@ -23,7 +24,6 @@ import pandas as pd
 from stable_baselines3.common.monitor import LoadMonitorResultsError, load_results
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_have import HAVESAC
 from sb3_have.algorithms import ALGORITHMS
 from sb3_have.benchmark.grid import Failures, Job
 from sb3_have.benchmark.provenance import machine
@@ -34,6 +34,7 @@ from sb3_have.configuration import env_wrapper, evaluation_env_kwargs
 from sb3_have.evaluation.episodes import Env, Step, Task
 from sb3_have.evaluation.evaluation import drive_tasks, episode_tasks, summarize
 from sb3_have.evaluation.recording import weighing
+from sb3_have.have import HAVESAC
 from sb3_have.sensors import SENSORS, SensorFailure, failures_for
 from sb3_have.train import Run
 
@@ -48,7 +49,8 @@ HEALTHY = {"modality": "none", "kind": "none", "severity": 0}
 
 
 def run_job(job: Job, runs: Path, device: str = "cpu", keep_checkpoint: bool = False) -> bool:
-    """Do what remains of a run.
+    """
+    Do what remains of a run.
 
     :param job: The run
     :param runs: Folder of the runs' folders
@@ -77,7 +79,8 @@ def final_folder(job: Job, folder: Path) -> Path:
 
 
 def trained(job: Job, folder: Path, device: str) -> OffPolicyAlgorithm | None:
-    """Train the model, or resume or load it; None if the training was stopped.
+    """
+    Train the model, or resume or load it; None if the training was stopped.
 
     :raises ValueError: If the folder is of a run with other settings, or was trained past the grid's steps
     """
@@ -133,7 +136,8 @@ def _load(job: Job, folder: Path, record: dict[str, Any], device: str) -> OffPol
 
 
 def n_parameters(model: OffPolicyAlgorithm) -> int:
-    """Count the trained parameters: without target networks, and without heads of auxiliary losses not in use.
+    """
+    Count the trained parameters: without target networks, and without heads of auxiliary losses not in use.
 
     :param model: The model
     """
@@ -250,7 +254,8 @@ def _read_episodes(path: Path) -> pd.DataFrame:
 
 
 def collect(job: Job, folder: Path) -> dict[str, pd.DataFrame]:
-    """Collect the rows of a finished run.
+    """
+    Collect the rows of a finished run.
 
     :param job: The run
     :param folder: Its folder

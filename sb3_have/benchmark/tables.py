@@ -36,7 +36,8 @@ BOTH = "black = frozen"
 
 
 def weather_table(results: Results) -> pd.DataFrame:
-    """Compare every method in every weather (the paper's Table 1): a row for each weather, measure and driver.
+    """
+    Compare every method in every weather (the paper's Table 1): a row for each weather, measure and driver.
 
     :param results: The results
     :return: Columns ``weather`` (the last is "all"), ``measure``, ``driver``, ``mean`` over seeds and episodes,
@@ -95,7 +96,8 @@ def _mean_and_std(mean: float, std: float, measure: Measure, bold: bool = False)
 
 
 def ablation_table(results: Results) -> pd.DataFrame:
-    """Compare the parts of HAVE one by one (the paper's Table 2), over all weathers.
+    """
+    Compare the parts of HAVE one by one (the paper's Table 2), over all weathers.
 
     :param results: The results
     :return: A row for each method of :data:`ABLATION` that has a finished run: ``method``, ``form``, ``parameters``,
@@ -134,7 +136,8 @@ def ablation_markdown(results: Results, table: pd.DataFrame) -> str:
 
 
 def score_table(results: Results, reference: str = "have", areas: bool = False) -> pd.DataFrame:
-    """Compute statistics over seeds and weathers with 95% intervals, which are NaN below :data:`MIN_SEEDS` seeds.
+    """
+    Compute statistics over seeds and weathers with 95% intervals, which are NaN below :data:`MIN_SEEDS` seeds.
 
     :param results: The results
     :param reference: Method to compare with each of the others
@@ -181,7 +184,8 @@ def score_markdown(table: pd.DataFrame, measure: Measure, reference: str) -> str
 
 
 def run_table(results: Results) -> pd.DataFrame:
-    """List the progress of every method: which seeds are finished, under way, or not begun.
+    """
+    List the progress of every method: which seeds are finished, under way, or not begun.
 
     Expected are the runs of the grids; if those are not known, every seed of every method.
 
@@ -228,7 +232,8 @@ def run_markdown(table: pd.DataFrame) -> str:
 
 
 def end_table(results: Results) -> pd.DataFrame:
-    """Count how the episodes of the finished runs ended.
+    """
+    Count how the episodes of the finished runs ended.
 
     :param results: The results
     :return: A row for each method: ``method``, ``episodes``, ``crashed`` and ``offroad`` (shares), ``steps`` (mean)
@@ -252,7 +257,8 @@ def end_markdown(table: pd.DataFrame) -> str:
 
 
 def failure_table(results: Results) -> pd.DataFrame:
-    """Compare return and distance under each sensor failure, and in the same episodes without a failure.
+    """
+    Compare return and distance under each sensor failure, and in the same episodes without a failure.
 
     Where a frozen sensor gave the same results as a black one, they are one case: an event camera that is frozen from
     the reset on shows no events.

@@ -31,7 +31,8 @@ class DamagedCheckpointError(ValueError):
 
 
 class Pickler(cloudpickle.Pickler):  # type: ignore[misc, unused-ignore]
-    """Pickler for lambdas too, which refers to objects that exist on both sides by their number.
+    """
+    Pickler for lambdas too, which refers to objects that exist on both sides by their number.
 
     :param file: File to write to
     :param existing: Objects to refer to instead of pickling them; the :class:`Unpickler` needs its own, in the same
@@ -57,7 +58,8 @@ class Pickler(cloudpickle.Pickler):  # type: ignore[misc, unused-ignore]
 
 
 class Unpickler(pickle.Unpickler):
-    """Reads what :class:`Pickler` wrote.
+    """
+    Reads what :class:`Pickler` wrote.
 
     :param file: File to read from
     :param existing: Objects in place of those that the pickler referred to
@@ -85,7 +87,8 @@ def loads(data: bytes, existing: Sequence[object] = ()) -> Any:
 
 
 def write_archive(path: Path, info: Mapping[str, Any], model: memoryview, state: Any) -> None:
-    """Write an archive, without copying large arrays.
+    """
+    Write an archive, without copying large arrays.
 
     :param path: Path of the file; missing folders are created
     :param info: A few values for JSON
@@ -138,7 +141,8 @@ def _sync_folder(folder: Path) -> None:
 
 
 def read_archive(path: Path) -> tuple[dict[str, Any], io.BytesIO, Any]:
-    """Read info, model and state from the file of :func:`write_archive`.
+    """
+    Read info, model and state from the file of :func:`write_archive`.
 
     The state is unpickled, which can execute any code: read only files that you wrote yourself.
 
@@ -164,7 +168,8 @@ def _read_array(archive: zipfile.ZipFile, name: str) -> np.ndarray:
 
 
 def read_info(path: Path) -> dict[str, Any]:
-    """Read only the info of an archive.
+    """
+    Read only the info of an archive.
 
     :raises DamagedCheckpointError: If it cannot be read
     """

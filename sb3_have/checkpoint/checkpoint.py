@@ -29,7 +29,8 @@ def save_checkpoint(
     callbacks: Callbacks = None,
     info: Mapping[str, Any] | None = None,
 ) -> None:
-    """Save a model and everything that its further training depends on in one file.
+    """
+    Save a model and everything that its further training depends on in one file.
 
     This includes all optimizers, the replay buffer, the environments in the middle of their episodes with all their
     wrappers (VecNormalize's statistics, stacked frames, Monitor), the random numbers of Python, NumPy and PyTorch, and
@@ -80,7 +81,8 @@ def load_checkpoint(
     callbacks: Callbacks = None,
     device: th.device | str = "auto",
 ) -> Any:
-    """Load the model of a checkpoint, ready to resume training::
+    """
+    Load the model of a checkpoint, ready to resume training::
 
         callback = ResumableCheckpointCallback("checkpoints", save_freq=10_000)
         HAVESAC("MultiInputPolicy", env, seed=0).learn(200_000, callback)
@@ -146,7 +148,8 @@ def end_last_episode(buffer: ReplayBuffer) -> None:
 
 
 def checkpoint_info(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read ``steps``, ``algorithm`` and ``info`` of a checkpoint without unpickling anything.
+    """
+    Read ``steps``, ``algorithm`` and ``info`` of a checkpoint without unpickling anything.
 
     :raises DamagedCheckpointError: If the file is damaged
     """

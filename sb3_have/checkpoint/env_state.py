@@ -73,7 +73,8 @@ class ResumableEnv(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def environments_state(vec_env: VecEnv, shared: Any = None) -> EnvironmentsState:
-    """Capture everything that decides what environments do next.
+    """
+    Capture everything that decides what environments do next.
 
     All attributes of all wrappers and environments are pickled together, so that shared objects stay shared. Windows
     and Monitor's open file are left out.
@@ -91,7 +92,8 @@ def environments_state(vec_env: VecEnv, shared: Any = None) -> EnvironmentsState
 
 
 def restore_environments(vec_env: VecEnv, state: EnvironmentsState) -> Any:
-    """Restore the state of environments.
+    """
+    Restore the state of environments.
 
     :param vec_env: Environments made in the same way; the state overrides other settings
     :param state: Result of :func:`environments_state`

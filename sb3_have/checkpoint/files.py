@@ -11,7 +11,8 @@ from filelock import AcquireReturnProxy, FileLock, Timeout
 
 
 def locked(folder: Path, patience: float = 5.0) -> AcquireReturnProxy[FileLock]:
-    """Lock a folder against other processes, for a ``with`` block or until ``.lock.release()``.
+    """
+    Lock a folder against other processes, for a ``with`` block or until ``.lock.release()``.
 
     The lock ends with the process, however it ends. A process may lock a folder that it has locked already.
 
@@ -26,7 +27,8 @@ def locked(folder: Path, patience: float = 5.0) -> AcquireReturnProxy[FileLock]:
 
 
 def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:
-    """Write a file completely, or leave the previous one as it was if that fails or the process dies.
+    """
+    Write a file completely, or leave the previous one as it was if that fails or the process dies.
 
     :param path: Path of the file
     :param write: Function that writes to the path it is given

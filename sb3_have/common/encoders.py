@@ -95,7 +95,7 @@ class BlockConv2d(nn.Conv2d):
 
 
 def default_layers(size: int) -> list[tuple[int, int, int]]:
-    """Filters, kernel size and stride of each convolution, for an image whose shorter side is ``size`` pixels."""
+    """Return filters, kernel size and stride of each convolution for an image whose shorter side is ``size`` pixels."""
     if size >= PAPER_ENCODER_MIN_SIZE:
         return [(32, 3, 2), (32, 3, 1), (32, 3, 1), (32, 3, 1)]
     if size >= 36:
@@ -245,7 +245,7 @@ class MultiModalEncoder(nn.Module):
         return th.stack([features.float() for features in encoded], dim=1)
 
     def image_dtype(self, device: th.device) -> th.dtype:
-        """The data type in which the image encoders compute on ``device``."""
+        """Return the data type in which the image encoders compute on ``device``."""
         bfloat16 = self.precision == "bfloat16" or (self.precision == "auto" and has_native_bfloat16(device.type))
         return th.bfloat16 if bfloat16 else th.float32
 
@@ -325,8 +325,7 @@ class MultiModalExtractor(BaseFeaturesExtractor):
 
 
 def one_hot(observations: th.Tensor, space: spaces.Space[Any]) -> th.Tensor:
-    """Encode the observations (B, ...) of a discrete space as SB3 does, and also where its values start at another
-    number than 0."""
+    """Encode the observations (B, ...) of a discrete space as SB3 does, even if its values do not start at 0."""
     if isinstance(space, spaces.Discrete | spaces.MultiDiscrete):
         observations = observations - th.as_tensor(space.start, device=observations.device)
     if isinstance(space, spaces.MultiDiscrete):
@@ -373,7 +372,7 @@ def _look_up(images: th.Tensor, signed: bool, dtype: th.dtype, block_size: int =
 
 @cache
 def _table(signed: bool, dtype: th.dtype) -> np.ndarray:
-    """The 256 values of :func:`decode_bytes`. OpenCV has no bfloat16, so its bits are returned as integers."""
+    """Return the 256 values of :func:`decode_bytes`; the bits of bfloat16 as integers for OpenCV."""
     table = decode_bytes(th.arange(256, device="cpu"), signed).to(dtype)
     return (table.view(th.int16) if dtype == th.bfloat16 else table).numpy()
 

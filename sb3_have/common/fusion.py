@@ -209,6 +209,8 @@ class _ChannelAttention(nn.Module):
 
     def forward(self, image: th.Tensor, query: th.Tensor, key: th.Tensor, value: th.Tensor) -> th.Tensor:
         """
+        Update a map.
+
         :param image: Map (B, C, H, W)
         :param query: From the map itself, as :meth:`CrossModalChannelAttention._by_head` returns it
         :param key: From the maps of the other modalities

@@ -246,7 +246,7 @@ class Camera:
         return np.asarray(far)
 
     def _paint(self, instants: int, faces: _Projected) -> NDArray[np.int32]:
-        """Number (from 1) of the face that each sample sees, or 0, (instants, sample rows, sample columns)."""
+        """Return the number (from 1) of the face of each sample, or 0 (instants, sample rows, sample columns)."""
         side = SUPERSAMPLING * self.size
         canvas = np.zeros((instants, side, side), dtype=np.int32)
         corners = faces.corners * SUPERSAMPLING - 0.5

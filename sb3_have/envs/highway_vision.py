@@ -404,5 +404,5 @@ class ReportTimeout(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
 
 
 def _sub_steps(config: Mapping[str, Any]) -> int:
-    """Number of simulation steps per control step, rounded up so that no time is lost."""
+    """Return the number of simulation steps per control step, rounded up so that no time is lost."""
     return -(-int(config["simulation_frequency"]) // int(config["policy_frequency"]))

@@ -77,11 +77,11 @@ class RoadShape:
         return self.swing * _sin(_WAVE * x)
 
     def slope(self, x: Any) -> Any:
-        """Derivative of :meth:`bend`, the tangent of the heading of the road at x [m]."""
+        """Return the derivative of :meth:`bend`, the tangent of the heading of the road at x [m]."""
         return self.swing * 2 * math.pi / PERIOD * _sin(_WAVE * x + 0.5 * math.pi)
 
     def direction(self, x: float) -> tuple[float, float]:
-        """Unit vector along the road at x [m]."""
+        """Return the unit vector along the road at x [m]."""
         if not self.swing:
             return 1.0, 0.0
         heading = math.atan(self.slope(x))
@@ -102,7 +102,7 @@ class RoadShape:
         return left, left + self.lane_width * (1 - _positive(taper) + _positive(taper - 1))
 
     def ramp_slope(self, x: Any) -> tuple[Any, Any]:
-        """Derivatives of the edges that :meth:`ramp` returns at x [m]."""
+        """Return the derivatives of the edges that :meth:`ramp` returns at x [m]."""
         if not self.ramps:
             return 0 * x, 0 * x
         u = x % PERIOD

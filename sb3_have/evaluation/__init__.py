@@ -1,4 +1,5 @@
-"""Drive and evaluate models and rule-based drivers, record episodes, and compute statistics over runs.
+"""
+Drive and evaluate models and rule-based drivers, record episodes, and compute statistics over runs.
 
 Training and figures do not belong here.
 """

@@ -104,9 +104,7 @@ class WeatherEvalCallback(BaseCallback):
             self._evaluate_if_due()
 
     def _evaluate_if_due(self) -> bool:
-        """
-        :return: Whether it was not interrupted
-        """
+        """Evaluate the model if an evaluation is due, and return whether it was not interrupted."""
         step = self.model.num_timesteps
         if self.eval_freq <= 0 or step // self.eval_freq == self._last_step // self.eval_freq:
             return True

@@ -29,7 +29,8 @@ class Predictor(Protocol):
 
 
 class Task(NamedTuple):
-    """One episode to drive.
+    """
+    One episode to drive.
 
     :param weather: Weather of the episode
     :param seed: Seed of the episode
@@ -42,7 +43,8 @@ class Task(NamedTuple):
 
 
 class EpisodeQueue(gym.Env[Any, Any]):
-    """An environment that works through a queue of episodes.
+    """
+    An environment that works through a queue of episodes.
 
     ``reset`` takes the next episode. Once the queue is empty, the environment idles: it returns its last observation
     without stepping.
@@ -92,7 +94,8 @@ def leave_interrupts_to_parent() -> None:
 
 
 class Step(NamedTuple):
-    """One step of n environments. Entries of environments without an episode have no meaning.
+    """
+    One step of n environments. Entries of environments without an episode have no meaning.
 
     :param numbers: Number of the episode that each environment drives, None if it has none left
     :param t: Steps of each episode before this one, shape (n,)
@@ -117,7 +120,8 @@ class Step(NamedTuple):
 
 
 def drive(model: Predictor, vec_env: VecEnv, deterministic: bool = True) -> Iterator[Step]:
-    """Drive all episodes of :class:`EpisodeQueue` environments, with one ``predict`` for all environments.
+    """
+    Drive all episodes of :class:`EpisodeQueue` environments, with one ``predict`` for all environments.
 
     Environments whose queue is empty are left out of the batch, unless the model returns a recurrent ``state``, which
     has a row for every environment.

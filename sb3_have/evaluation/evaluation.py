@@ -32,7 +32,8 @@ def evaluate(
     env_wrapper: Callable[[Env], Env] | None = None,
     vec_env_cls: type[DummyVecEnv] | type[SubprocVecEnv] = DummyVecEnv,
 ) -> pd.DataFrame:
-    """Evaluate a driver in each weather.
+    """
+    Evaluate a driver in each weather.
 
     :param model: Anything with SB3's ``predict``; its environments are wrapped as in training, see
         :func:`~sb3_have.evaluation.wrapping.wrap_as_trained`
@@ -83,7 +84,8 @@ def evaluate_episodes(
     env_wrapper: Callable[[Env], Env] | None = None,
     vec_env_cls: type[DummyVecEnv] | type[SubprocVecEnv] = DummyVecEnv,
 ) -> pd.DataFrame:
-    """Drive the episodes of :func:`evaluate`, which has the same parameters, without averaging them.
+    """
+    Drive the episodes of :func:`evaluate`, which has the same parameters, without averaging them.
 
     :return: A row per episode: ``weather, seed, return, steps, distance, crashed, offroad``
     """
@@ -115,7 +117,8 @@ def drive_tasks(
     vec_env_cls: type[DummyVecEnv] | type[SubprocVecEnv] = DummyVecEnv,
     on_step: Callable[[Step], None] | None = None,
 ) -> pd.DataFrame:
-    """Drive any episodes. Parameters that :func:`evaluate` has mean the same here.
+    """
+    Drive any episodes. Parameters that :func:`evaluate` has mean the same here.
 
     :param tasks: The episodes
     :param on_step: Called after each step; ``step.numbers`` are positions in ``tasks``
@@ -161,7 +164,8 @@ def _outcome(step: Step, i: int) -> dict[str, Any]:
 
 
 def summarize(episodes: pd.DataFrame) -> pd.DataFrame:
-    """Average episodes by weather.
+    """
+    Average episodes by weather.
 
     :param episodes: From :func:`evaluate_episodes`
     :return: A row per weather, as from :func:`evaluate`
@@ -178,7 +182,8 @@ def summarize(episodes: pd.DataFrame) -> pd.DataFrame:
 
 
 def format_table(results: Mapping[str, pd.DataFrame]) -> str:
-    """Format evaluations side by side, as in the paper's Table 1: episode reward (ER) and distance (D) by weather.
+    """
+    Format evaluations side by side, as in the paper's Table 1: episode reward (ER) and distance (D) by weather.
 
     :param results: From :func:`evaluate`, by driver; all over the same weathers
     :return: A Markdown table of mean ± standard deviation; the last rows are over all episodes
@@ -199,7 +204,8 @@ def format_table(results: Mapping[str, pd.DataFrame]) -> str:
 
 
 def pooled(frame: pd.DataFrame, name: str) -> tuple[float, float]:
-    """Compute mean and standard deviation over all episodes, from those of groups of episodes.
+    """
+    Compute mean and standard deviation over all episodes, from those of groups of episodes.
 
     :param frame: Columns ``episodes``, ``<name>_mean`` and ``<name>_std``
     :param name: "return" or "distance"

@@ -20,7 +20,8 @@ from sb3_have.evaluation.wrapping import wrap_as_trained
 
 @dataclass
 class Recording:
-    """An episode of T steps. Entry t is what the driver knew when it chose action t, and the reward for that action.
+    """
+    An episode of T steps. Entry t is what the driver knew when it chose action t, and the reward for that action.
 
     :param weather: Weather of the episode; empty if the environment has none
     :param seconds: Length of a step [s]; None if the environment has no ``metadata["render_fps"]``
@@ -71,7 +72,8 @@ def record_episode(
     progress_bar: bool = False,
     normalizer: VecNormalize | None = None,
 ) -> Recording:
-    """Drive one episode and record it.
+    """
+    Drive one episode and record it.
 
     :param model: Anything with SB3's ``predict``; the environment is wrapped as in training, see
         :func:`~sb3_have.evaluation.wrapping.wrap_as_trained`. ``modality_weights`` and ``critic.decompose`` are
@@ -172,7 +174,8 @@ def _make(env: str | Env, keywords: dict[str, Any], render: bool) -> Env:
 
 
 class _RecordedEpisode(EpisodeQueue):
-    """One episode of an environment, with the environment's own observations, rewards and pictures.
+    """
+    One episode of an environment, with the environment's own observations, rewards and pictures.
 
     ``DummyVecEnv`` resets it at the end, which leaves the environment as it is because the queue is empty.
     """

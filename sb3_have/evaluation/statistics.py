@@ -1,4 +1,5 @@
-"""Statistics over training runs.
+"""
+Statistics over training runs.
 
 They follow Agarwal et al., "Deep Reinforcement Learning at the Edge of the Statistical Precipice" (NeurIPS 2021).
 
@@ -24,7 +25,8 @@ class Interval(NamedTuple):
 
 
 def mean(scores: ArrayLike) -> Any:
-    """Compute the mean over runs and tasks.
+    """
+    Compute the mean over runs and tasks.
 
     :param scores: (n_runs, n_tasks), or a stack of such tables (..., n_runs, n_tasks)
     :return: A float, or (...) for a stack
@@ -39,7 +41,8 @@ def median(scores: ArrayLike) -> Any:
 
 
 def iqm(scores: ArrayLike) -> Any:
-    """Compute the interquartile mean: the mean of all scores together, without the lowest and the highest quarter.
+    """
+    Compute the interquartile mean: the mean of all scores together, without the lowest and the highest quarter.
 
     A quarter of n scores is ``n // 4``, so fewer than four scores are all kept. Parameters as for :func:`mean`.
     """
@@ -50,7 +53,8 @@ def iqm(scores: ArrayLike) -> Any:
 
 
 def optimality_gap(scores: ArrayLike, target: float = 1.0) -> Any:
-    """Compute the mean shortfall of the scores from a target; scores above it do not make up for others below.
+    """
+    Compute the mean shortfall of the scores from a target; scores above it do not make up for others below.
 
     :param scores: As for :func:`mean`
     :param target: In the scores' unit
@@ -60,7 +64,8 @@ def optimality_gap(scores: ArrayLike, target: float = 1.0) -> Any:
 
 
 def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> Any:
-    """Compute how often a run of ``x`` beats one of ``y`` on the same task.
+    """
+    Compute how often a run of ``x`` beats one of ``y`` on the same task.
 
     This is the mean over tasks of Mann-Whitney's U / (N M).
 
@@ -78,7 +83,8 @@ def probability_of_improvement(x: ArrayLike, y: ArrayLike) -> Any:
 
 
 def performance_profile(scores: ArrayLike, thresholds: ArrayLike) -> np.ndarray:
-    """Compute the share of runs, over all tasks, that score above each threshold.
+    """
+    Compute the share of runs, over all tasks, that score above each threshold.
 
     For a band, bootstrap ``partial(performance_profile, thresholds=...)``.
 
@@ -98,7 +104,8 @@ def stratified_bootstrap(
     seed: int = 0,
     whole_runs: bool = False,
 ) -> Interval:
-    """Bootstrap percentile intervals by resampling runs within each task, independently for each task and table.
+    """
+    Bootstrap percentile intervals by resampling runs within each task, independently for each task and table.
 
     Use it as ``stratified_bootstrap(iqm, scores)`` or ``stratified_bootstrap(probability_of_improvement, x, y)``.
 

@@ -24,7 +24,8 @@ from sb3_have.checkpoint.archive import loads, read_archive
 
 
 def wrap_as_trained(vec_env: VecEnv, model: Any, normalizer: VecNormalize | None = None) -> VecEnv:
-    """Wrap an environment so that a model reads it as in training.
+    """
+    Wrap an environment so that a model reads it as in training.
 
     :param vec_env: The bare environment, images channel-last
     :param model: If it has its training environment, the wrappers of that one are repeated: ``VecFrameStack``,
@@ -103,7 +104,8 @@ def _differences(expected: spaces.Space[Any], given: spaces.Space[Any]) -> str:
 
 
 def saved_normalizer(file: Path) -> VecNormalize | None:
-    """Read the ``VecNormalize`` of a training from a file, which is unpickled.
+    """
+    Read the ``VecNormalize`` of a training from a file, which is unpickled.
 
     :param file: A checkpoint, or a file that ``VecNormalize.save`` wrote
     :return: None if a checkpoint has none

@@ -27,7 +27,6 @@ from torch import nn, optim
 from torch.nn.modules.module import register_module_parameter_registration_hook
 from torch.nn.parameter import is_lazy
 
-from sb3_have import __version__
 from sb3_have.common import crossq
 from sb3_have.common.buffers import stacked_frames
 from sb3_have.common.encoders import ImageEncoder, MultiModalExtractor, VectorEncoder
@@ -60,7 +59,7 @@ CLASSES: dict[str, type[Any]] = {
 NAMES = {kind: name for name, kind in CLASSES.items()}
 # Numbers in a space, which bounds the memory that a file can ask for; a 4K image has 2.5e7
 MAX_SIZE = 10**8
-PACKAGES = ("torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy")
+PACKAGES = ("sb3_have", "torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy")
 NORMALIZED = "the exported policy expects normalized observations but does not include the statistics"
 
 
@@ -99,7 +98,7 @@ def describe(model: BaseAlgorithm | BasePolicy) -> dict[str, Any]:
         "observation_space": _space_to_json(policy.observation_space),
         "action_space": _space_to_json(policy.action_space),
         "n_stack": _n_stack(model),
-        "versions": {"sb3_have": __version__, **{name: version(name) for name in PACKAGES}},
+        "versions": {name: version(name) for name in PACKAGES},
     }
 
 

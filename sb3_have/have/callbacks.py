@@ -144,6 +144,14 @@ class ModalityWeightsCallback(BaseCallback):
             self._log_episode()
         return True
 
+    def get_state(self) -> dict[str, deque[np.ndarray]]:
+        """Return the latest weights for a checkpoint."""
+        return self._readings
+
+    def set_state(self, state: dict[str, deque[np.ndarray]]) -> None:
+        """Restore the latest weights from a checkpoint."""
+        self._readings = state
+
     def _episode_is_due(self) -> bool:
         if not self.episode_freq or not (self._tensorboard or self.folder):
             return False

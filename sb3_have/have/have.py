@@ -264,7 +264,7 @@ class HAVESAC(SAC):
 
     def _full_policy_kwargs(self) -> dict[str, Any]:
         """
-        The user's ``policy_kwargs`` with the arguments of HAVESAC that belong to the policy.
+        Merge the user's ``policy_kwargs`` with the arguments of HAVESAC that belong to the policy.
 
         :raises ValueError: if an argument is given twice, is SAC's, or is not that of a model that is being loaded
         """
@@ -441,7 +441,7 @@ class HAVESAC(SAC):
         entropy_bonus: th.Tensor,
     ) -> th.Tensor:
         """
-        The regression target y (B,): the Bellman target (Eq. 8), or Eq. 10 with ``target="paper"``.
+        Compute the regression target y (B,): the Bellman target (Eq. 8), or Eq. 10 with ``target="paper"``.
 
         :param next_features: (B, d, F) by the target encoder
         :param next_actions: (B, A) by the actor
@@ -459,8 +459,8 @@ class HAVESAC(SAC):
 
     def _critic_loss(self, values: Values, target_q: th.Tensor) -> th.Tensor:
         """
-        Squared error of the Q-value and, times ``local_coef``, of its parts: q_g, q_l, and the mean over the modalities
-        of q_i. It is halved and summed over the twins, as in SB3.
+        Compute the squared error of the Q-value and, times ``local_coef``, of its parts: q_g, q_l, and the mean over
+        the modalities of q_i. It is halved and summed over the twins, as in SB3.
 
         :param values: the critic's values at the sampled actions
         :param target_q: (B,)
@@ -479,7 +479,7 @@ class HAVESAC(SAC):
 
     def modality_weights(self, observation: np.ndarray | dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """
-        The attention weights of the modalities (Eq. 9), which sum to 1.
+        Compute the attention weights of the modalities (Eq. 9), which sum to 1.
 
         :param observation: one observation or a batch, as for ``predict``
         :return: an array (B,) for each modality
@@ -551,7 +551,7 @@ class HAVESAC(SAC):
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
 
     def _replay_buffer_kwargs(self) -> dict[str, Any]:
-        """The user's keyword arguments for a ModalityReplayBuffer, and those that follow from the environment."""
+        """Return the arguments of a ModalityReplayBuffer: the user's, and those that follow from the environment."""
         return {"n_stack": self.n_stack, "n_steps": self.n_steps, "gamma": self.gamma, **self.replay_buffer_kwargs}
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
@@ -571,7 +571,7 @@ class HAVESAC(SAC):
 
 
 def flat_callbacks(callback: MaybeCallback) -> list[Any]:
-    """The callback, or the callbacks of a list, and all that they contain."""
+    """List a callback, or the callbacks of a list, and all that they contain."""
     parts = callback if isinstance(callback, list) else getattr(callback, "callbacks", None)
     if parts is not None:
         return [inner for part in parts for inner in flat_callbacks(part)]

@@ -194,7 +194,7 @@ class MultiModalPolicy(SACPolicy):
 
     def modality_weights(self, observation: np.ndarray | dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         """
-        The attention weights of the modalities (Eq. 9), which sum to 1.
+        Compute the attention weights of the modalities (Eq. 9), which sum to 1.
 
         :param observation: one observation or a batch, as for ``predict``
         :return: an array (B,) for each modality

@@ -98,7 +98,7 @@ class EventFile:
         return int(height), int(width)
 
     def __len__(self) -> int:
-        """Number of events."""
+        """Return the number of events."""
         return len(self._columns["t"])
 
     def __enter__(self) -> EventFile:

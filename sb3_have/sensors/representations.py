@@ -215,7 +215,7 @@ def decode_events(codes: ArrayLike, representation: Representation = "sbt") -> N
 
 
 def _unit(representation: Representation) -> np.float32:
-    """Number of codes between the values 0 and 1."""
+    """Return the number of codes between the values 0 and 1."""
     channels(representation, 1)  # raises if the representation is unknown
     return np.float32(EVENT_LIMIT if representation == "time_surface" else 1)
 
