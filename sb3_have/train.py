@@ -5,8 +5,8 @@ Train by a configuration of ``zoo_configs``: a run that can be stopped and resum
 
 The same command resumes. The folder holds ``monitor.csv`` (training episodes), ``evaluation.csv`` (a row per weather
 at every evaluation), ``log-<first step>/progress.csv`` (SB3's log), the newest two ``checkpoint-<step>`` and
-``model.zip``. A resumed run goes on in the middle of its episodes; on a CPU it ends with the bits of an uninterrupted
-one (:mod:`sb3_have.checkpoint.checkpoint`).
+``model.zip``. A resumed run continues in the middle of its episodes; on a CPU the result equals that of an
+uninterrupted run bit for bit (:mod:`sb3_have.checkpoint.checkpoint`).
 """
 
 from __future__ import annotations
@@ -164,6 +164,7 @@ class Run:
         :raises BlockingIOError: If another process works in the folder
         :raises ValueError: If the folder is of another run, or of one that cannot be resumed
         """
+        self._make_evaluation().check()
         self.out.mkdir(parents=True, exist_ok=True)
         with locked(self.out):
             checkpoint = self._checkpoint_to_resume()
@@ -214,7 +215,7 @@ class Run:
             info, settings = checkpoint_info(checkpoint)["info"], self._settings()
             if info.get("settings") != settings:
                 raise ValueError(
-                    f"{checkpoint} is of a run with {info.get('settings')}, not {settings}; choose another folder"
+                    f"{checkpoint} belongs to a run with {info.get('settings')}, not {settings}; choose another folder"
                 )
             self.seconds = info["seconds"]
             for path in self.out.glob("*monitor.csv"):
@@ -231,7 +232,7 @@ class Run:
         log = self.out / "log-0"
         recorded = [*self.out.glob("*monitor.csv"), *self.out.glob("evaluation.csv")]
         if recorded and not log.exists():
-            raise ValueError(f"{recorded[0]} is of no run of this program; remove it, or choose another folder")
+            raise ValueError(f"{recorded[0]} was not written by this program; remove it, or choose another folder")
         log.mkdir(exist_ok=True)
         for path in recorded:
             path.unlink()
@@ -276,7 +277,7 @@ def main(arguments: list[str] | None = None) -> None:
         default=[],
         type=hyperparameter,
         metavar="NAME:VALUE",
-        help='in the configuration\'s place, in YAML: gamma:0.99 "policy_kwargs:{precision: float32}"',
+        help='override hyper-parameters, as YAML: gamma:0.99 "policy_kwargs:{precision: float32}"',
     )
     parser.add_argument("--steps", type=int, help="in all; default: n_timesteps of the configuration")
     parser.add_argument("--seed", type=int, default=0)

@@ -33,7 +33,7 @@ def sample_havesac_params(
     policy_kwargs = config.get("policy_kwargs") or {}
     value_estimation = {**policy_kwargs, **config}.get("value_estimation", "have")
     is_paper = config.get("target") == "paper"
-    # The learning rate matters most, and 3e-4 is far too small for budgets of some 10,000 updates
+    # The learning rate matters most, and 3e-4 is far too small for budgets of about 10,000 updates
     sampled: dict[str, Any] = {
         "learning_rate": trial.suggest_float("learning_rate", 2e-4, 3e-3, log=True),
         "one_minus_gamma": trial.suggest_float("one_minus_gamma", 0.005, 0.1, log=True),
@@ -48,7 +48,7 @@ def sample_havesac_params(
     if value_estimation != "gve" and not is_paper:
         sampled["local_coef"] = trial.suggest_float("local_coef", 0.1, 4.0, log=True)
     if value_estimation == "have" and not is_paper and "refusion" not in policy_kwargs:
-        # Leave out "free": its values may fall where a critic's rise
+        # Leave out "free": its output may decrease when a critic's value increases
         sampled["refusion"] = trial.suggest_categorical("refusion", ["convex", "monotone"])
     converted = convert_havesac_params(sampled)
     for name in ("gamma", "batch_size"):

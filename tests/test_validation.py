@@ -3,7 +3,7 @@
 import copy
 import pickle
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -18,8 +18,11 @@ from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
-from sb3_have import HAVESAC, ModalityReplayBuffer
+from sb3_have import HAVESAC, ModalityReplayBuffer, ModalityWeightsCallback
 from sb3_have.common.encoders import MultiModalEncoder, one_hot
+from sb3_have.common.log_names import log_names
+from sb3_have.have import AuxiliaryLoss
+from sb3_have.have.auxiliary import LatentTransitions
 
 FLOAT, BYTE = np.float32, np.uint8
 
@@ -298,3 +301,31 @@ def test_parallel_training_of_the_zoo_is_refused() -> None:
     for wrapped in (lambda callback: callback, lambda callback: [callback]):
         with pytest.raises(ValueError, match="ParallelTrainCallback"):
             model.learn(10, callback=wrapped(callbacks.ParallelTrainCallback(gradient_steps=5)))
+
+
+# -- Logging
+
+
+@given(st.lists(st.text("ab_", max_size=60), unique=True, max_size=8), st.integers(10, 30))
+def test_log_names_are_short_and_different(names: list[str], length: int) -> None:
+    short = log_names(names, length)
+    assert short.keys() == set(names)
+    assert len(set(short.values())) == len(names)
+    assert all(len(value) <= length for value in short.values())
+    assert all(short[name] == name for name in names if len(name) <= length)
+
+
+def test_training_with_long_names(capsys: pytest.CaptureFixture[str]) -> None:
+    names = [f"front_left_fisheye_camera_{kind}" for kind in ("rgb", "depth", "infrared")]
+
+    class Long(AuxiliaryLoss):
+        terms: ClassVar[tuple[str, ...]] = tuple(f"prediction_of_what_the_camera_sees_{kind}" for kind in "ab")
+
+        def forward(self, batch: LatentTransitions) -> dict[str, th.Tensor]:
+            return {term: batch.features.square().mean() for term in self.terms}
+
+    model = tiny_model(
+        spaces.Dict({name: vector(2) for name in names}), auxiliary={"long": Long}, verbose=1, learning_starts=10
+    )
+    model.learn(60, ModalityWeightsCallback())
+    assert "weight_front_left" in capsys.readouterr().out

@@ -240,7 +240,7 @@ class MultiModalEncoder(nn.Module):
             if features.shape != expected:
                 raise ValueError(
                     f"modality {name!r}: {type(encoder).__name__} gave features of shape {tuple(features.shape)}, "
-                    f"expected {expected}; let it end in the `features_dim` units it is given."
+                    f"expected {expected}; its output must have `features_dim` units."
                 )
         return th.stack([features.float() for features in encoded], dim=1)
 

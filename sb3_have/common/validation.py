@@ -92,10 +92,10 @@ def _as_box(key: str, space: spaces.Space[Any], normalize_images: bool, channels
     # The smallest axis is certainly that of the channels if the others are equal or much larger
     if not (channels < height == width or 2 * channels <= min(height, width)):
         raise ValueError(
-            f"{where}: the shape {space.shape} does not show which axis holds the channels, because they are almost as "
-            f"many as rows or columns. SB3 takes the smallest axis, so this would be read as {channels} channels of "
-            f"{height}x{width} pixels. If that is right, pass `policy_kwargs=dict(channels_first=True)`; otherwise use "
-            "fewer channels (event bins, stacked frames) or a larger image."
+            f"{where}: the shape {space.shape} does not show which axis holds the channels, because there are almost as "
+            f"many channels as rows or columns. SB3 takes the smallest axis: {channels} channels of {height}x{width} "
+            "pixels. If that is right, pass `policy_kwargs=dict(channels_first=True)`; otherwise use fewer channels "
+            "(event bins, stacked frames) or a larger image."
         )
     return space
 
@@ -146,7 +146,7 @@ def check_action_space(space: spaces.Space[Any]) -> None:
     if not (np.isfinite(width).all() and (width > 0).all()):
         raise ValueError(
             f"action space: high - low must be finite and positive, got {width} for {space}; use "
-            "gymnasium.wrappers.RescaleAction, or remove an action without a choice."
+            "gymnasium.wrappers.RescaleAction, or remove action dimensions that allow only one value."
         )
 
 
@@ -223,7 +223,7 @@ def _check_value(key: str, value: np.ndarray, space: spaces.Space[Any]) -> None:
     if value.shape not in shapes and value.shape[1:] not in shapes:
         raise ValueError(
             f"observation key {key!r}: expected the shape {' or '.join(map(str, shapes))}, or a batch of it, got "
-            f"{value.shape}; give it as the training environment did (stacked, if by VecFrameStack, and of that size)."
+            f"{value.shape}; pass it as in training, including frame stacking and image size."
         )
     if not np.issubdtype(value.dtype, np.floating):
         return

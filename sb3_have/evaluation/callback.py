@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 from sb3_have.checkpoint.files import write_atomically
 from sb3_have.checkpoint.random_state import same_random_numbers
 from sb3_have.checkpoint.stopping import handle_signals, stop_training
-from sb3_have.evaluation.evaluation import evaluate
+from sb3_have.evaluation.evaluation import check_environment, evaluate
 
 # The same for all runs, so that their evaluations drive the same episodes
 EVALUATION_SEED = 1_000_000
@@ -78,6 +78,21 @@ class WeatherEvalCallback(BaseCallback):
             env_wrapper=env_wrapper,
             vec_env_cls=vec_env_cls,
         )
+
+        self._check = partial(check_environment, env_id, weathers[0], env_kwargs, env_wrapper)
+
+    def check(self) -> None:
+        """
+        Check that an environment for evaluations can be made, before a training that may take hours.
+
+        :raises ValueError: If it cannot be made
+        """
+        if self.eval_freq > 0:
+            with same_random_numbers():
+                self._check(model=getattr(self, "model", None))
+
+    def _init_callback(self) -> None:
+        self.check()
 
     def _on_training_start(self) -> None:
         self._started, self._last_step = time.monotonic(), 0

@@ -151,6 +151,34 @@ def drive_tasks(
     return pd.DataFrame([{"weather": task.weather, "seed": task.seed, **outcomes[i]} for i, task in numbered])
 
 
+def check_environment(
+    env_id: str,
+    weather: str,
+    env_kwargs: Mapping[str, Any] | None = None,
+    env_wrapper: Callable[[Env], Env] | None = None,
+    model: Predictor | None = None,
+) -> None:
+    """
+    Check that an environment can be made for :func:`evaluate`, whose parameters mean the same here.
+
+    :param weather: Name of a weather
+    :param model: A model that its observations have to fit
+    :raises ValueError: If it cannot be made, or does not fit
+    """
+    try:
+        vec_env = DummyVecEnv([partial(_make_env, env_id, dict(env_kwargs or {}), Task(weather, 0, env_wrapper))])
+    except (TypeError, ValueError, gym.error.Error) as error:
+        raise ValueError(
+            f"{env_id} cannot be evaluated in the weather {weather!r}: {error}; fix its keywords, or train without "
+            "evaluations (eval_freq=0)"
+        ) from error
+    try:
+        if model is not None:
+            wrap_as_trained(vec_env, model)
+    finally:
+        vec_env.close()
+
+
 def _make_env(env_id: str, env_kwargs: dict[str, Any], task: Task) -> Env:
     env: Env = gym.make(env_id, weather=task.weather, **env_kwargs)
     return env if task.env_wrapper is None else task.env_wrapper(env)

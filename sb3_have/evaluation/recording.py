@@ -167,9 +167,9 @@ def _make(env: str | Env, keywords: dict[str, Any], render: bool) -> Env:
             made = gym.make(env, **{**keywords, "render_mode": "rgb_array"})
         return made
     if isinstance(env, VecEnv):
-        raise TypeError("env is vectorized: pass the environment inside, it is wrapped as in training")
+        raise TypeError("env is vectorized: pass a single environment, which will be wrapped as in training")
     if keywords:
-        raise TypeError(f"{', '.join(keywords)}: only for the id of an environment, not for an environment")
+        raise TypeError(f"{', '.join(keywords)}: can only be used with the id of an environment")
     return env
 
 

@@ -16,6 +16,7 @@ from stable_baselines3.common.logger import Image, TensorBoardOutputFormat
 
 from sb3_have.checkpoint.files import write_atomically
 from sb3_have.checkpoint.random_state import same_random_numbers
+from sb3_have.common.log_names import log_names
 from sb3_have.evaluation.recording import record_episode, weighing
 
 if TYPE_CHECKING:
@@ -135,9 +136,10 @@ class ModalityWeightsCallback(BaseCallback):
             for name, weights in self._weigh(self.model._last_obs).items():
                 self._readings.setdefault(name, deque(maxlen=self.window)).append(weights)
         # Record at every step, because the logger may be dumped at any time
+        names = log_names(self._readings, 26)
         for name, readings in self._readings.items():
             latest = np.concatenate(readings)
-            self.logger.record(f"have/weight_{name}", float(latest.mean()))
+            self.logger.record(f"have/weight_{names[name]}", float(latest.mean()))
             if self._tensorboard:
                 self.logger.record(f"have/weights_{name}", latest, exclude=NOT_TEXT)
         if self._episode_is_due():

@@ -20,6 +20,7 @@ from stable_baselines3.common.utils import polyak_update
 
 from sb3_have.common.augmentation import check_random_shift, mean_over_copies, shifted_copies
 from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
+from sb3_have.common.log_names import log_names
 from sb3_have.common.validation import (
     cast_observation,
     check_action_space,
@@ -266,7 +267,7 @@ class HAVESAC(SAC):
         """
         Merge the user's ``policy_kwargs`` with the arguments of HAVESAC that belong to the policy.
 
-        :raises ValueError: if an argument is given twice, is SAC's, or is not that of a model that is being loaded
+        :raises ValueError: if an argument is given twice, belongs to SAC, or differs from that of the saved model
         """
         for name in ("features_extractor_class", "features_extractor_kwargs", "share_features_extractor"):
             if name in self.policy_kwargs:
@@ -313,6 +314,7 @@ class HAVESAC(SAC):
         ent_coefs, ent_coef_losses = list[th.Tensor](), list[th.Tensor]()
         aux_losses: dict[str, list[th.Tensor]] = {}
 
+        # Values, rewards and targets have the shape (B,), those of the twins (K, B)
         for _ in range(gradient_steps):
             self._n_updates += 1
 
@@ -324,8 +326,9 @@ class HAVESAC(SAC):
             # For n-step returns, the discount factor is gamma**n_steps (when no early termination)
             discounts = replay_data.discounts if replay_data.discounts is not None else self.gamma
 
-            # Encode every observation once. The features of the target encoder serve the next action, the target
-            # and DeepMDP
+            # Encode every observation once: the features of the target encoder serve the target, DeepMDP and the next
+            # action, because encoding next observations by the critic's encoder too would take 11 to 23% longer.
+            # Critic and actor read features with dropout, auxiliary losses and the target those without
             features = self.policy.encode(replay_data.observations)
             with th.no_grad():
                 next_features = self.critic_target.encoder(replay_data.next_observations)
@@ -372,7 +375,7 @@ class HAVESAC(SAC):
             self.critic.optimizer.step()
 
             if self._n_updates % self.policy_delay == 0:
-                # Action by the current actor for the sampled state, from detached features
+                # Action by the current actor for the sampled state, from detached features of before the critic's step
                 actor_features = critic_features[:batch_size].detach()
                 actions_pi, log_prob = self.actor.action_log_prob(actor_features.flatten(start_dim=1))
 
@@ -404,7 +407,7 @@ class HAVESAC(SAC):
                 # Copy running stats, see SB3's issue #996
                 polyak_update(self.batch_norm_stats, self.batch_norm_stats_target, 1.0)
 
-        # Drop the graph of the last batch, which would prevent copying the policy
+        # Drop the graph of the last batch: `copy.deepcopy(policy)` fails for tensors that have one
         for name, value in vars(self.actor.action_dist).items():
             if isinstance(value, th.Tensor):
                 setattr(self.actor.action_dist, name, value.detach())
@@ -418,8 +421,9 @@ class HAVESAC(SAC):
             self.logger.record("train/actor_loss", self._mean(actor_losses))
         if ent_coef_losses:
             self.logger.record("train/ent_coef_loss", self._mean(ent_coef_losses))
+        names = log_names(aux_losses, 24)
         for term, losses in aux_losses.items():
-            self.logger.record(f"train/aux_{term}_loss", self._mean(losses))
+            self.logger.record(f"train/aux_{names[term]}_loss", self._mean(losses))
 
     def _mean(self, losses: Sequence[th.Tensor]) -> float | th.Tensor:
         """``.item()`` synchronises the GPU, so there the mean stays a tensor until logs are dumped."""
@@ -460,7 +464,8 @@ class HAVESAC(SAC):
     def _critic_loss(self, values: Values, target_q: th.Tensor) -> th.Tensor:
         """
         Compute the squared error of the Q-value and, times ``local_coef``, of its parts: q_g, q_l, and the mean over
-        the modalities of q_i. It is halved and summed over the twins, as in SB3.
+        the modalities of q_i. It is halved and summed over
+        the twins, as in SB3, whose ``critic_loss`` has the first term alone. The paper has no loss of the parts.
 
         :param values: the critic's values at the sampled actions
         :param target_q: (B,)

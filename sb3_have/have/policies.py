@@ -145,8 +145,8 @@ class MultiModalPolicy(SACPolicy):
                 f"auxiliary losses {list(self.auxiliary_losses)}: more than one has the terms {sorted(doubled)}; "
                 "rename them."
             )
-        # DeepMDP's heads are drawn first and even if they are not kept, so that the same seed gives the same initial
-        # actor with and without auxiliary losses
+        # DeepMDP's heads are always created first, even if they are not used, so that the same seed gives the same
+        # initial actor with and without auxiliary losses
         losses: dict[str, type[AuxiliaryLoss]] = {"deepmdp": DeepMDP, **self.auxiliary_losses}
         heads = {name: loss_class(*sizes) for name, loss_class in losses.items()}
         self.auxiliary = nn.ModuleDict({name: heads[name] for name in self.auxiliary_losses})
@@ -225,7 +225,7 @@ class MultiModalPolicy(SACPolicy):
 
 
 class SquashedGaussian(SquashedDiagGaussianDistribution):
-    """SB3's distribution without PyTorch's check for NaN on a GPU, which would make the host wait in every step."""
+    """SB3's distribution without PyTorch's check for NaN on a GPU, which would synchronise it in every step."""
 
     def proba_distribution(self: SelfGaussian, mean_actions: th.Tensor, log_std: th.Tensor) -> SelfGaussian:
         self.distribution = Normal(mean_actions, log_std.exp(), validate_args=mean_actions.device.type == "cpu")
