@@ -282,7 +282,7 @@ def env_wrapper(config: Mapping[str, Any]) -> Callable[[Env], Env] | None:
           - gymnasium.wrappers.RecordEpisodeStatistics
 
     :return: Can be pickled, so that it reaches the workers of ``SubprocVecEnv``
-    :raises ValueError: If an entry has another form or its path leads nowhere
+    :raises ValueError: If an entry is malformed or cannot be imported
     """
     wrappers = _entries(config, "env_wrapper")
     return partial(_wrap, wrappers) if wrappers else None
@@ -325,7 +325,7 @@ def _locate(path: str, key: str) -> Any:
     try:
         return getattr(import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise ValueError(f"there is no {key} {path!r}: {error}") from error
+        raise ValueError(f"{key}: cannot import {path!r}: {error}") from error
 
 
 def hyperparameter(text: str) -> tuple[str, Any]:

@@ -130,7 +130,7 @@ def test_checkpoint_stays_only_if_asked_for(tmp_path: Path) -> None:
     assert run_job(long, tmp_path)
     assert newest_checkpoint(folder) is None
     assert {path.name for path in folder.glob("log-*")} == {"log-0", "log-30"}
-    with pytest.raises(ValueError, match="trained on to step 40, from the 30"):
+    with pytest.raises(ValueError, match="was trained to step 40, beyond the 30"):
         run_job(short, tmp_path)
     with pytest.raises(ValueError, match="no checkpoint to resume from"):
         run_job(make_grid(tmp_path, steps=50).jobs()[0], tmp_path)

@@ -155,7 +155,9 @@ def test_worker_processes_of_other_environments(tmp_path: Path) -> None:
     assert state.lost == []
     with pytest.raises(ValueError, match="has to be the outermost wrapper"):
         restore_environments(inner, state)
-    with pytest.raises(ValueError, match="ResumableEnv > Monitor > Drifting, and it was given ResumableEnv > Drifting"):
+    with pytest.raises(
+        ValueError, match="ResumableEnv > Monitor > Drifting, but the environment has ResumableEnv > Drifting"
+    ):
         restore_environments(bare, state)
     bare.reset()
 
@@ -177,7 +179,7 @@ def test_training_that_a_callback_ends(tmp_path: Path) -> None:
         def _on_step(self) -> bool:
             return self.num_timesteps < 25
 
-    with pytest.warns(UserWarning, match=r"A callback ended the training in step 25, .* no checkpoint of it"):
+    with pytest.warns(UserWarning, match=r"A callback ended the training at step 25 .*no checkpoint was saved"):
         sac(drifting()).learn(40, [ResumableCheckpointCallback(tmp_path, 10), Ends()])
     assert [path.name for path in checkpoints(tmp_path)] == ["checkpoint-10", "checkpoint-20"]
 

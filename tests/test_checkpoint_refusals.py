@@ -94,7 +94,7 @@ def test_folder_is_for_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with (tmp_path / ".lock").open("w") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
         (tmp_path / "checkpoint-20").write_bytes(b"unfinished, of the other process")
-        with pytest.raises(BlockingIOError, match="another process works in"):
+        with pytest.raises(BlockingIOError, match="another process is using"):
             make_model().learn(9, callback)
     with pytest.raises(ZeroDivisionError):
         make_model().learn(9, [callback, Fails()])

@@ -154,10 +154,10 @@ def test_other_environments_are_refused(tmp_path: Path) -> None:
     state = environments_state(make_vec_env())
     with pytest.raises(ValueError, match=r"VecNormalize > DummyVecEnv > Monitor > TimeLimit > Drifting, and.*> Named"):
         restore_environments(make_vec_env(Named), state)
-    with pytest.raises(ValueError, match="other wrappers"):
+    with pytest.raises(ValueError, match="saved with the wrappers"):
         restore_environments(make_vec_env(n_envs=2), state)
     bare = environments_state(DummyVecEnv([Drifting]))
-    with pytest.raises(ValueError, match="other wrappers"):
+    with pytest.raises(ValueError, match="saved with the wrappers"):
         restore_environments(DummyVecEnv([lambda: ResumableEnv(Drifting())]), bare)
 
 

@@ -236,7 +236,7 @@ def test_folder_is_for_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with (tmp_path / ".lock").open("w") as other, monkeypatch.context() as patch:
         patch.setattr(train, "locked", lambda folder: locked(folder, patience=0.0))
         fcntl.flock(other, fcntl.LOCK_EX)  # as another process does
-        with pytest.raises(BlockingIOError, match="another process works in"):
+        with pytest.raises(BlockingIOError, match="another process is using"):
             make_run(tmp_path).train(8)
     assert not (tmp_path / "model.zip").exists()
     with locked(tmp_path), locked(tmp_path):  # a process may lock a folder twice

@@ -117,7 +117,7 @@ class Results:
         return ordered({method for method, _ in self.runs})
 
     def expected_seeds(self, method: str) -> list[int]:
-        """Return the seeds of a method in the grids; of a method in none of them, every seed that there is."""
+        """Return the seeds of a method in the grids, or all existing seeds if no grid lists the method."""
         return sorted({seed for name, seed in self.planned if name == method} or {seed for _, seed in self.runs})
 
     @property

@@ -1,4 +1,4 @@
-"""Write the results of a benchmark: a run's rows come in whole and once, and never mixed with other settings."""
+"""Write the results of a benchmark: rows of a run are written once, atomically, and never mixed."""
 
 from __future__ import annotations
 

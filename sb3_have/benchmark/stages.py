@@ -129,8 +129,8 @@ def _load(job: Job, folder: Path, record: dict[str, Any], device: str) -> OffPol
     model = ALGORITHMS[job.algo].load(folder / "model.zip", device=device)
     if model.num_timesteps != record["steps"]:
         raise ValueError(
-            f"{folder / 'model.zip'} has been trained on to step {model.num_timesteps}, from the {record['steps']} "
-            "steps of the grid; choose another --runs"
+            f"{folder / 'model.zip'} was trained to step {model.num_timesteps}, beyond the {record['steps']} steps of "
+            "the grid; choose another --runs"
         )
     return model
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from sb3_have.checkpoint.files import write_atomically
 
-# Arrays of at least so many bytes become entries of their own, written from memory and read into memory without a copy.
+# Arrays of at least this many bytes become separate entries, written and read without a copy
 LARGE = 1 << 20
 
 # The first entries of every archive; large arrays follow.
@@ -32,7 +32,7 @@ class DamagedCheckpointError(ValueError):
 
 class Pickler(cloudpickle.Pickler):  # type: ignore[misc, unused-ignore]
     """
-    Pickler for lambdas too, which refers to objects that exist on both sides by their number.
+    Pickler for lambdas too, which replaces objects that exist on both sides by an index.
 
     :param file: File to write to
     :param existing: Objects to refer to instead of pickling them; the :class:`Unpickler` needs its own, in the same

@@ -78,7 +78,7 @@ class ResumableCheckpointCallback(BaseCallback):
         assert isinstance(self.model, OffPolicyAlgorithm)  # for mypy
         self._last_step = self._saved_step = self.model.num_timesteps
         self.folder.mkdir(parents=True, exist_ok=True)
-        # Training that failed may have left the lock to the next call of `learn`
+        # A call of `learn` that failed may still hold the lock
         if self._lock is None:
             self._lock = locked(self.folder).lock
         self._refuse_later_checkpoints()
@@ -125,8 +125,8 @@ class ResumableCheckpointCallback(BaseCallback):
             self._save()
         elif new_obs is not None:
             warnings.warn(
-                f"A callback ended the training in step {self.model.num_timesteps}, whose transition is in no replay "
-                "buffer, so there is no checkpoint of it.",
+                f"A callback ended the training at step {self.model.num_timesteps} before its transition was stored, "
+                "so no checkpoint was saved.",
                 stacklevel=2,
             )
         self._release()

@@ -106,7 +106,7 @@ def load_checkpoint(
     :return: The model
     :raises DamagedCheckpointError: If the file is damaged
     :raises FileNotFoundError: If there is none
-    :raises ValueError: If the environments have other wrappers, or are more or fewer
+    :raises ValueError: If the environments have other wrappers, or differ in number
     """
     file = Path(path)
     if file.is_dir():
@@ -134,7 +134,7 @@ def load_checkpoint(
 
 
 def end_last_episode(buffer: ReplayBuffer) -> None:
-    """End the last episode, so that no return and no next observation reaches into what is stored next."""
+    """End the last episode, so that n-step returns and next observations do not cross into later transitions."""
     if hasattr(buffer, "truncate_last_trajectory"):
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="The last trajectory in the replay buffer will be truncated")

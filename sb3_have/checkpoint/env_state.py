@@ -98,10 +98,10 @@ def restore_environments(vec_env: VecEnv, state: EnvironmentsState) -> Any:
     :param vec_env: Environments made in the same way; the state overrides other settings
     :param state: Result of :func:`environments_state`
     :return: The objects that were ``shared``
-    :raises ValueError: If they are more or fewer, or have other wrappers
+    :raises ValueError: If they differ in number, or have other wrappers
     """
     if len(state.workers) not in (0, vec_env.num_envs):
-        raise ValueError(f"a checkpoint of {len(state.workers)} environments was given {vec_env.num_envs}")
+        raise ValueError(f"the checkpoint has {len(state.workers)} environments, but {vec_env.num_envs} were passed")
     shared = _restore(_vec_layers(vec_env), state.layers)
     base = vec_env.unwrapped
     if state.workers and not _are_resumable(base):
@@ -184,8 +184,8 @@ def _failure(value: Any, layers: Sequence[Any]) -> str:
 def _restore(layers: Sequence[Any], state: LayersState) -> Any:
     if (names := _names(layers)) != state.names:
         raise ValueError(
-            f"the checkpoint is of environments with other wrappers: {' > '.join(state.names)}, and it was given "
-            f"{' > '.join(names)}; make them as in the training that wrote it"
+            f"the checkpoint was saved with the wrappers {' > '.join(state.names)}, but the environment has "
+            f"{' > '.join(names)}; wrap it as in the training"
         )
     states, known, shared = loads(state.pickled, layers)
     for layer, attributes, known_names in zip(layers, states, known, strict=True):

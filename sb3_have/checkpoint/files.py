@@ -23,7 +23,7 @@ def locked(folder: Path, patience: float = 5.0) -> AcquireReturnProxy[FileLock]:
     try:
         return FileLock(folder.resolve() / ".lock", is_singleton=True).acquire(patience)
     except Timeout:
-        raise BlockingIOError(f"another process works in {folder}; end it, or wait for it") from None
+        raise BlockingIOError(f"another process is using {folder}; end it, or wait for it") from None
 
 
 def write_atomically(path: Path, write: Callable[[Path], Any]) -> None:

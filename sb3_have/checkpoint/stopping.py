@@ -1,4 +1,4 @@
-"""Ending training in good order."""
+"""End training cleanly."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def stop_training(callback: BaseCallback) -> NoReturn:
 
 @contextmanager
 def handle_signals(handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    """Handle Ctrl-C and SIGTERM within a ``with`` block; in other threads than the main one Python cannot."""
+    """Handle Ctrl-C and SIGTERM within a ``with`` block, if it is in the main thread, as Python requires."""
     before = {}
     if threading.current_thread() is threading.main_thread():
         before = {number: signal.signal(number, handler) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -41,7 +41,7 @@ class StopTrainingOnSignal(BaseCallback):
     Callback for ending training between two rollouts on Ctrl-C, SIGTERM or after a time limit.
 
     Call ``learn`` in its ``with`` block. Put it after the callback that saves checkpoints, which then saves one, and
-    before callbacks that take long, as those that evaluate::
+    before slow callbacks, such as evaluations::
 
         with StopTrainingOnSignal(time_limit=3600) as stop:
             model.learn(1_000_000, [ResumableCheckpointCallback("checkpoints", 10_000), stop])

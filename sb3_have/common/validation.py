@@ -92,8 +92,8 @@ def _as_box(key: str, space: spaces.Space[Any], normalize_images: bool, channels
     # The smallest axis is certainly that of the channels if the others are equal or much larger
     if not (channels < height == width or 2 * channels <= min(height, width)):
         raise ValueError(
-            f"{where}: the shape {space.shape} does not show which axis holds the channels, because there are almost as "
-            f"many channels as rows or columns. SB3 takes the smallest axis: {channels} channels of {height}x{width} "
+            f"{where}: the shape {space.shape} does not show which axis holds the channels, because there are almost "
+            f"as many channels as rows or columns. SB3 takes the smallest: {channels} channels of {height}x{width} "
             "pixels. If that is right, pass `policy_kwargs=dict(channels_first=True)`; otherwise use fewer channels "
             "(event bins, stacked frames) or a larger image."
         )

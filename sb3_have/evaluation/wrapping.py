@@ -57,7 +57,7 @@ def wrap_as_trained(vec_env: VecEnv, model: Any, normalizer: VecNormalize | None
 
 
 def _stack_and_transpose(vec_env: VecEnv, expected: spaces.Space[Any]) -> VecEnv:
-    """Stack frames if the model reads a multiple of the numbers, then transpose images if the spaces match only so."""
+    """Stack frames if the model expects them stacked, and transpose images if that is needed to match its space."""
     n_stack = spaces.flatdim(expected) / spaces.flatdim(vec_env.observation_space)
     if n_stack > 1 and n_stack.is_integer():
         vec_env = VecFrameStack(vec_env, int(n_stack))

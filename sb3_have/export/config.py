@@ -57,7 +57,7 @@ CLASSES: dict[str, type[Any]] = {
     for kind in kinds
 }
 NAMES = {kind: name for name, kind in CLASSES.items()}
-# Numbers in a space, which bounds the memory that a file can ask for; a 4K image has 2.5e7
+# Maximum number of elements in a space, to limit the memory that a file can request; a 4K image has 2.5e7
 MAX_SIZE = 10**8
 PACKAGES = ("sb3_have", "torch", "stable-baselines3", "sb3-contrib", "gymnasium", "numpy")
 NORMALIZED = "the exported policy expects normalized observations but does not include the statistics"
@@ -79,7 +79,7 @@ def describe(model: BaseAlgorithm | BasePolicy) -> dict[str, Any]:
     """
     Describe a policy in JSON types, and warn if it was trained under ``VecNormalize``.
 
-    :param model: A model, or its policy, which knows neither its algorithm nor the frame stack
+    :param model: A model, or its policy, which stores neither the algorithm nor the frame stack
     """
     policy = policy_of(model)
     kwargs = policy._get_constructor_parameters()

@@ -127,7 +127,7 @@ class AuxiliaryLossCallback(BaseCallback):
         return True
 
     def _set_coefficients(self) -> None:
-        # not the model's own `_current_progress_remaining`, which is the last run's until the first update
+        # The model's `_current_progress_remaining` is that of the previous run until the first update
         progress_remaining = 1 - self.model.num_timesteps / self.model._total_timesteps
         factor = 1.0 if self.schedule is None else self.schedule(progress_remaining)
         for term, coefficient in self.coefficients.items():

@@ -21,7 +21,7 @@ from sb3_have.plotting.style import modality_styles
 LINE, GAP, CHART = 18, 4, 84
 # Repeating patterns of drawn pixels
 DASHES = {"-": (1,), "--": (1, 1, 1, 1, 1, 1, 0, 0, 0), "-.": (1, 1, 1, 1, 1, 0, 0, 1, 0, 0), ":": (1, 1, 0, 0)}
-# A GIF by write_gif() has at most so many frames, at so many frames per second
+# Maximum number of frames of a GIF by write_gif(), and frames per second
 MAX_FRAMES, GIF_FPS = 100, 10
 
 

@@ -133,8 +133,8 @@ def whole_evaluations(rows: pd.DataFrame, n_weathers: int) -> pd.DataFrame:
     """
     Select the evaluations whose mean over seeds can be compared between steps.
 
-    A mean over other seeds at every step would jump where no run does. So only the seeds count that have come
-    furthest, at the steps that all of them have, in all weathers.
+    Averaging different seeds at each step would create jumps, so only the seeds that trained longest are used, at the
+    steps that all of them have, in all weathers.
 
     :param rows: Evaluations of one method, with ``seed``, ``step`` and ``weather``
     :param n_weathers: Number of weathers in a whole evaluation

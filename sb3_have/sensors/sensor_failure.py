@@ -192,7 +192,7 @@ class SensorFailure(gym.Wrapper[Any, Any, Any, Any], gym.utils.RecordConstructor
         return self._function(image, rng, **extra, **self._parameters)
 
     def _refuse_twin(self, env: gym.Env[Any, Any]) -> None:
-        """Refuse a second failure of the same name, whose truth would overwrite that of the first."""
+        """Refuse a second failure of the same name, whose entry in ``info`` would overwrite that of the first."""
         while isinstance(env, gym.Wrapper):
             if isinstance(env, SensorFailure) and (env.key, env.name) == (self.key, self.name):
                 raise ValueError(
