@@ -75,7 +75,7 @@ def write(paper: Picture, text: str, x: int, y: int) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").strip().splitlines()[0])
     parser.add_argument("--out", type=Path, default=Path("docs/failures.png"))
     out = parser.parse_args().out
     out.parent.mkdir(parents=True, exist_ok=True)

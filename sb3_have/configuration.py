@@ -92,7 +92,8 @@ def _folder() -> Path:
 
 def _suggest(word: str, known: Iterable[str]) -> str:
     near = get_close_matches(word, list(known), n=1, cutoff=0.75)
-    return "".join(f"; did you mean {match!r}?" for match in near) + f"; there are {', '.join(sorted(known))}"
+    available = ", ".join(sorted(known))
+    return f"; did you mean {near[0]!r}? Available: {available}" if near else f"; available: {available}"
 
 
 def read_config(name: str | Path) -> dict[str, Any]:
@@ -125,9 +126,9 @@ def load_config(name: str | Path, env_id: str) -> dict[str, Any]:
     if "base" not in content:
         return block
 
-    # Merge the block into that of the base
-    known = known_keys(algorithm_of(name))
-    base = {key: value for key, value in load_config(_base(name, content), env_id).items() if key in known}
+    # Merge the block into that of the base, without what only other algorithms have
+    others = set().union(*map(known_keys, ALGORITHMS)) - known_keys(algorithm_of(name))
+    base = {key: value for key, value in load_config(_base(name, content), env_id).items() if key not in others}
     merged = {**base, **block}
     if "env_kwargs" in base and "env_kwargs" in block:
         merged["env_kwargs"] = {**base["env_kwargs"], **block["env_kwargs"]}
@@ -158,7 +159,8 @@ def _base(name: str | Path, content: Mapping[str, Any]) -> str | Path:
 
 def known_keys(algo: str) -> set[str]:
     """Return the keys that a configuration for an algorithm may have."""
-    return {*ZOO_KEYS, *inspect.signature(ALGORITHMS[algo]).parameters}
+    set_by_the_run = {"env", "seed", "device", "_init_setup_model"}
+    return {*ZOO_KEYS, *inspect.signature(ALGORITHMS[algo]).parameters} - set_by_the_run
 
 
 def check_keys(config: Mapping[str, Any], algo: str) -> None:

@@ -89,11 +89,12 @@ def make_training_env(env_id: str, config: Mapping[str, Any], out: Path | None =
 
     makers: list[Callable[[], gym.Env[Any, Any]]] = [partial(make, index) for index in range(n_envs)]
     vec_env = wrap_vec_env(config, SubprocVecEnv(makers) if n_envs > 1 else DummyVecEnv(makers))
-    normalize = normalize_kwargs(config)
-    if normalize is not None:
-        vec_env = VecNormalize(vec_env, **normalize)
     n_stack = config.get("frame_stack") or 1
-    return VecFrameStack(vec_env, n_stack) if n_stack > 1 else vec_env
+    if n_stack > 1:
+        vec_env = VecFrameStack(vec_env, n_stack)
+    # SB3 stores observations as they were before VecNormalize, so it has to be the outermost wrapper
+    normalize = normalize_kwargs(config)
+    return vec_env if normalize is None else VecNormalize(vec_env, **normalize)
 
 
 class Run:
@@ -206,6 +207,8 @@ class Run:
             logger.close()
         self.interrupted = stop.interrupted
         write_atomically(self.out / "model.zip", model.save)
+        if (normalizer := model.get_vec_normalize_env()) is not None:
+            write_atomically(self.out / "vecnormalize.pkl", normalizer.save)  # type: ignore[arg-type]
         return model
 
     def _checkpoint_to_resume(self) -> Path | None:
@@ -265,7 +268,9 @@ class Run:
 
 def main(arguments: list[str] | None = None) -> None:
     """Command line of ``python -m sb3_have.train``."""
-    parser = argparse.ArgumentParser(prog="python -m sb3_have.train", description=(__doc__ or "").splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_have.train", description=(__doc__ or "").strip().splitlines()[0]
+    )
     parser.add_argument(
         "--config", default="have", help="YAML file, or the name of one in zoo_configs; default: %(default)s"
     )
@@ -279,7 +284,7 @@ def main(arguments: list[str] | None = None) -> None:
         metavar="NAME:VALUE",
         help='override hyper-parameters, as YAML: gamma:0.99 "policy_kwargs:{precision: float32}"',
     )
-    parser.add_argument("--steps", type=int, help="in all; default: n_timesteps of the configuration")
+    parser.add_argument("--steps", type=int, help="total training steps; default: n_timesteps of the configuration")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True, help="folder of the run; the same folder resumes it")
     parser.add_argument("--eval-freq", type=int, default=10_000, help="steps between evaluations, 0 for none")

@@ -153,6 +153,8 @@ def zoo_arguments(command: str, given: Sequence[str]) -> list[str]:
     for package in options.gym_packages:
         import_module(package)
 
+    if options.method and options.conf_file:
+        parser.error("--method is short for -conf; use one of them")
     # Find the configuration, its algorithm, and the log folder
     conf = options.method or options.conf_file
     if conf is None and options.algo in (None, "havesac"):

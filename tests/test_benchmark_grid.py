@@ -93,7 +93,7 @@ def test_image_size_of_the_grid_reaches_every_method(tmp_path: Path) -> None:
     [
         ({"methodes": ["have"]}, "unknown key 'methodes'; did you mean 'methods'?"),
         ({"seeds": None}, "the key 'seeds' is missing"),
-        ({"methods": ["hvae"]}, "methods: no configuration 'hvae'"),
+        ({"methods": ["hvae"]}, "methods: there is no configuration 'hvae'"),
         ({"methods": ["hvae"]}, "; did you mean 'have'?"),
         ({"methods": []}, "methods: Tuple should have at least 1 item after validation, not 0, got []"),
         ({"methods": ["have", "have"]}, "methods: 'have' is listed twice"),
@@ -149,7 +149,9 @@ def test_values_are_read(tmp_path: Path) -> None:
     assert grid.weathers == ("WetNoon",)
 
 
-@pytest.mark.parametrize("path", sorted(GRIDS.rglob("*.yml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path", sorted([*GRIDS.glob("*.yml"), *GRIDS.glob("search/*.yml")]), ids=lambda path: path.stem
+)
 def test_shipped_grid(path: Path) -> None:
     grid = read_grid(path)
     assert grid.steps >= 30_000 and len(grid.seeds) >= 3

@@ -176,7 +176,7 @@ def test_parameters_are_those_that_are_trained() -> None:
     """DeepMDP's heads count only if that loss is on."""
     kwargs: dict[str, Any] = {"policy_kwargs": TINY["policy_kwargs"], "buffer_size": 10}
     sac, deepmdp = (HAVESAC("MultiInputPolicy", gym.make(ENV_ID), auxiliary=a, **kwargs) for a in (None, "deepmdp"))
-    heads = sum(parameter.numel() for parameter in sac.policy.auxiliary.parameters())
+    heads = sum(parameter.numel() for parameter in deepmdp.policy.auxiliary.parameters())
     assert heads > 0 and stages.n_parameters(sac) == stages.n_parameters(deepmdp) - heads
     trained = [*deepmdp.critic.parameters(), *deepmdp.actor.parameters(), *deepmdp.policy.auxiliary.parameters()]
     assert stages.n_parameters(deepmdp) == sum(parameter.numel() for parameter in trained)

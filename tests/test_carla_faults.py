@@ -356,7 +356,7 @@ def test_two_environments_on_one_server(server: Server, env: CarlaVisionEnv) -> 
 
 
 def test_a_training_run_and_its_evaluation(monkeypatch: pytest.MonkeyPatch, server: Server) -> None:
-    config = load_config("havesac", "CarlaVision-v0")
+    config = load_config("have", "CarlaVision-v0")
     other = Server(port=2010)
     install(monkeypatch, server, other)
     training = CarlaVisionEnv(**{**config["env_kwargs"], **SMALL})

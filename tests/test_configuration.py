@@ -32,6 +32,7 @@ from sb3_have.configuration import (
     normalize_kwargs,
 )
 from sb3_have.envs.drivers import RandomDriver
+from sb3_have.evaluation import callback
 from sb3_have.evaluation.evaluation import evaluate_episodes
 from sb3_have.have.auxiliary import DeepMDP
 from sb3_have.train import Run
@@ -49,7 +50,7 @@ def write(folder: Path, content: dict[str, Any], name: str = "mine") -> str:
 
 def test_configurations_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert load_config(write(tmp_path, {"A-v0": {"gamma": 0.5}}), "A-v0") == {"gamma": 0.5}
-    with pytest.raises(FileNotFoundError, match=r"'heve'; did you mean 'have'.*there are concat, crossq"):
+    with pytest.raises(FileNotFoundError, match=r"'heve'; did you mean 'have'.*Available: concat, crossq"):
         config_path("heve")
     with pytest.raises(KeyError, match=r"Pendulum-v1.*only for HighwayVision-v0, CarlaVision-v0, Reliab"):
         load_config("have", "Pendulum-v1")
@@ -93,7 +94,7 @@ def test_file_names_its_algorithm(tmp_path: Path) -> None:
         "tqc": "tqc",
         "crossq": "crossq",
     }
-    with pytest.raises(ValueError, match=r"mine\.yml: there is no algo 'tcq'.*there are crossq, havesac"):
+    with pytest.raises(ValueError, match=r"mine\.yml: there is no algo 'tcq'.*vailable: crossq, havesac"):
         algorithm_of(write(tmp_path, {"algo": "tcq"}))
 
 
@@ -121,11 +122,11 @@ def test_evaluation_has_keywords_of_its_own(tmp_path: Path, monkeypatch: pytest.
     class Enough(Exception):
         pass
 
-    def record(*args: Any, **kwargs: Any) -> None:
-        evaluated.append(args[5])
+    def record(env_id: str, weather: str, env_kwargs: dict[str, Any], *args: Any, **kwargs: Any) -> None:
+        evaluated.append(env_kwargs)
         raise Enough
 
-    monkeypatch.setattr(train, "evaluate", record)
+    monkeypatch.setattr(callback, "check_environment", record)
     (tmp_path / "mine.yml").write_text(yaml.safe_dump({ENV_ID: {**CONFIG, "env_kwargs": {"weather": "fast"}}}))
     run = ["--config", str(tmp_path / "mine.yml"), "--env", ENV_ID, "--algo", "sac", "--steps", "1", "--eval-freq", "1"]
     for number, more in enumerate(([], ["--eval-env-kwargs", "image_size:40", "port:2010", "weather:slow"])):
@@ -176,7 +177,7 @@ def test_dotted_paths_become_classes() -> None:
 
 @pytest.mark.parametrize("path", ["sb3_have.Nothing", "no_such_module.Buffer"])
 def test_wrong_dotted_paths_are_explained(path: str) -> None:
-    with pytest.raises(ValueError, match=f"no replay_buffer_class '{path}'"):
+    with pytest.raises(ValueError, match=f"replay_buffer_class: cannot import '{path}'"):
         model_kwargs({"replay_buffer_class": path})
 
 
@@ -258,7 +259,9 @@ def test_noise_and_callbacks_reach_the_training(tmp_path: Path) -> None:
         "noise_std": 0.1,
         "callback": [{STOP: {"max_episodes": 2}}, f"{STOP}: {{max_episodes: 2}}"],
     }
-    model = Run(config, ENV_ID, tmp_path, algo="sac", eval_freq=0, device="cpu").train(100)
+    run = Run(config, ENV_ID, tmp_path, algo="sac", eval_freq=0, device="cpu")
+    with pytest.warns(UserWarning, match="no checkpoint was saved"):
+        model = run.train(100)
     assert isinstance(model.action_noise, NormalActionNoise)
     assert len((tmp_path / "monitor.csv").read_text().splitlines()) == 4, "training stops after two episodes"
 
@@ -295,9 +298,9 @@ def test_no_env_wrapper() -> None:
 @pytest.mark.parametrize(
     ("spec", "message"),
     [
-        ("gymnasium.wrappers.Nothing", "no env_wrapper 'gymnasium.wrappers.Nothing'.*Nothing"),
+        ("gymnasium.wrappers.Nothing", "env_wrapper: cannot import 'gymnasium.wrappers.Nothing'.*Nothing"),
         ("no_such_module.Wrapper", "no_such_module"),
-        ("Wrapper", "no env_wrapper 'Wrapper'"),
+        ("Wrapper", "env_wrapper: cannot import 'Wrapper'"),
         ({"a.B": {}, "c.D": {}}, "module.Class"),
         ({"gymnasium.wrappers.TimeLimit": 3}, "module.Class"),
         ([3], "got 3"),

@@ -142,7 +142,7 @@ def test_worker_processes_render(tmp_path: Path) -> None:
 def test_a_function_needs_a_size(wrapper: Any) -> None:
     """Finding it out would render."""
     env: Env = gym.make("HalfCheetah-v5", render_mode="rgb_array", width=36, height=36)
-    with pytest.raises(ValueError, match=rf"{wrapper.__name__} of a MuJoCo environment needs image_size="):
+    with pytest.raises(ValueError, match=rf"{wrapper.__name__}: a function as source needs image_size="):
         wrapper(RenderObservation(env), source=lambda env: np.ones((4, 4), np.float32))
     assert env.unwrapped.mujoco_renderer.viewer is None  # type: ignore[attr-defined]
 

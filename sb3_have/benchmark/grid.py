@@ -39,7 +39,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, field_validator, model_validator
 
 from sb3_have.benchmark.reading import method_name
-from sb3_have.configuration import algorithm_of, config_names, config_path, known_keys, load_config
+from sb3_have.configuration import algorithm_of, config_path, known_keys, load_config
 from sb3_have.envs.weather import WEATHERS
 from sb3_have.sensors import SENSORS, failures_for
 
@@ -110,6 +110,13 @@ class Grid(BaseModel):
             raise ValueError(f"{repeated[0]!r} is listed twice")
         return items
 
+    @field_validator("*", mode="before")
+    @classmethod
+    def _no_booleans(cls, value: Any) -> Any:
+        if isinstance(value, bool):
+            raise ValueError("a boolean is not a number")
+        return value
+
     @field_validator("seeds")
     @classmethod
     def _not_negative(cls, seeds: tuple[int, ...]) -> tuple[int, ...]:
@@ -178,18 +185,20 @@ class Grid(BaseModel):
         try:
             return beside if beside.is_file() else config_path(method)
         except FileNotFoundError as error:
-            raise GridError(f"methods: {error}{_suggestion(method, config_names())}") from None
+            raise GridError(f"methods: {error}") from None
 
     def _config(self, name: str, file: Path) -> dict[str, Any]:
         """Return the hyper-parameters of a method, merged with the grid's."""
         try:
             own = load_config(str(file), self.env)
-        except KeyError as error:
+            algo = algorithm_of(file)
+        except (KeyError, ValueError) as error:
             raise GridError(f"methods: {error.args[0]}") from None
         config = merge(own, self.hyperparams)
         if self.modalities and len(config.get("env_kwargs", {}).get("modalities", self.modalities)) > 1:
             config["env_kwargs"] = {**config.get("env_kwargs", {}), "modalities": [*self.modalities]}
-        algo = algorithm_of(file)
+        if config.get("normalize"):
+            raise GridError(f"hyperparams of {name}: normalize is not supported, as model.zip has no statistics")
         try:
             _known(config, known_keys(algo), f"hyperparams of {name} ({algo}): ")
         except ValueError as error:

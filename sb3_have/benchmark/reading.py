@@ -14,7 +14,21 @@ from numpy.typing import NDArray
 
 # Order of the methods in every table and figure; others follow in alphabetical order
 METHODS = (
-    *("rgb", "event", "depth", "sac", "deepmdp", "gve", "gve-wide", "drq", "transfuser", "efnet", "tqc", "crossq"),
+    *(
+        "rgb",
+        "event",
+        "depth",
+        "sac",
+        "concat",
+        "deepmdp",
+        "gve",
+        "gve-wide",
+        "drq",
+        "transfuser",
+        "efnet",
+        "tqc",
+        "crossq",
+    ),
     *("lve", "lve-paper", "have-paper", "have", "have-dropout"),
 )
 

@@ -356,7 +356,7 @@ def _listed(names: Iterable[str]) -> str:
 def main(arguments: list[str] | None = None) -> None:
     """Command line of ``python -m sb3_have.benchmark report``."""
     parser = argparse.ArgumentParser(
-        prog="python -m sb3_have.benchmark report", description=(__doc__ or "").splitlines()[0]
+        prog="python -m sb3_have.benchmark report", description=(__doc__ or "").strip().splitlines()[0]
     )
     parser.add_argument("results", nargs="+", type=Path, help="folders with the CSV files of a benchmark, to be joined")
     parser.add_argument("--out", type=Path, help="folder of the report; default: report in the first folder")

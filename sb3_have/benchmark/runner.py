@@ -183,7 +183,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Command line of ``python -m sb3_have.benchmark run``."""
     parser = argparse.ArgumentParser(
         prog="python -m sb3_have.benchmark run",
-        description=(__doc__ or "").splitlines()[0],
+        description=(__doc__ or "").strip().splitlines()[0],
         epilog="Exit code: 0 if all runs are finished, 1 if some failed, 3 if stopped before the end.",
     )
     parser.add_argument("grid", type=Path, help="YAML file, see sb3_have.benchmark.grid")

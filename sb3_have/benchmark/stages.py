@@ -34,7 +34,6 @@ from sb3_have.configuration import env_wrapper, evaluation_env_kwargs
 from sb3_have.evaluation.episodes import Env, Step, Task
 from sb3_have.evaluation.evaluation import drive_tasks, episode_tasks, summarize
 from sb3_have.evaluation.recording import weighing
-from sb3_have.have import HAVESAC
 from sb3_have.sensors import SENSORS, SensorFailure, failures_for
 from sb3_have.train import Run
 
@@ -137,19 +136,14 @@ def _load(job: Job, folder: Path, record: dict[str, Any], device: str) -> OffPol
 
 def n_parameters(model: OffPolicyAlgorithm) -> int:
     """
-    Count the trained parameters: without target networks, and without heads of auxiliary losses not in use.
+    Count the trained parameters, without those of target networks.
 
     :param model: The model
     """
-    left_out = ["critic_target."]
-    if isinstance(model, HAVESAC):
-        heads: dict[str, Any] = dict(model.policy.auxiliary.items())
-        terms = model.auxiliary_coefs.keys()
-        left_out += [f"auxiliary.{name}." for name, head in heads.items() if terms.isdisjoint(head.terms)]
     return sum(
         parameter.numel()
         for name, parameter in model.policy.named_parameters()
-        if parameter.requires_grad and not name.startswith(tuple(left_out))
+        if parameter.requires_grad and not name.startswith("critic_target.")
     )
 
 
@@ -286,6 +280,6 @@ def collect(job: Job, folder: Path) -> dict[str, pd.DataFrame]:
 def steps_done(folder: Path) -> int:
     """Count the training steps of a run in finished episodes."""
     # Another process may be writing the file
-    with suppress(OSError, ValueError, KeyError, LoadMonitorResultsError):
+    with suppress(OSError, ValueError, KeyError, IndexError, AssertionError, LoadMonitorResultsError):
         return int(load_results(str(folder))["l"].sum())
     return 0

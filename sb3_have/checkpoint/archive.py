@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import os
@@ -199,7 +200,12 @@ def _opened(path: Path) -> Iterator[zipfile.ZipFile]:
             if [entry.filename for entry in entries] != names or not stored:
                 raise zipfile.BadZipFile("its entries are not those of a checkpoint")
             yield archive
-    except (FileNotFoundError, PermissionError, IsADirectoryError):
+    except MemoryError:
         raise
+    except OSError as error:
+        # Other errors, such as too many open files, do not mean that the file is damaged
+        if error.errno not in (None, errno.EINVAL, errno.EIO):
+            raise
+        raise DamagedCheckpointError(f"{path} is damaged ({error}); use another one") from error
     except Exception as error:  # zipfile raises many kinds for corrupted bytes
         raise DamagedCheckpointError(f"{path} is damaged or not a checkpoint ({error}); use another one") from error

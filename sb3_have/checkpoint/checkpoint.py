@@ -21,6 +21,7 @@ from sb3_have.checkpoint.archive import damage, read_archive, read_info, write_a
 from sb3_have.checkpoint.callback_state import Callbacks, callbacks_state, restore_callbacks
 from sb3_have.checkpoint.env_state import environments_state, restore_environments
 from sb3_have.checkpoint.random_state import random_states, set_random_states
+from sb3_have.checkpoint.replay_state import at_full_size, filled_part
 
 
 def save_checkpoint(
@@ -64,7 +65,7 @@ def save_checkpoint(
     state = {
         "algorithm": type(model),
         "environments": environments,
-        "replay_buffer": model.replay_buffer,
+        "replay_buffer": filled_part(model.replay_buffer),
         "callbacks": callbacks_state(callbacks),
         # Last, after everything that may draw
         "random": random_states(),
@@ -115,7 +116,7 @@ def load_checkpoint(
             raise FileNotFoundError(f"{file} has no checkpoint-<step> that can be read")
         file = newest
     _, saved, state = read_archive(file)
-    buffer = state["replay_buffer"]
+    buffer = at_full_size(state["replay_buffer"])
     with warnings.catch_warnings():
         # Give SB3 the buffer, so that it does not create a second one; n-step returns are set up in it
         warnings.filterwarnings("ignore", message="`n_steps=")
@@ -163,7 +164,8 @@ def checkpoint_step(path: Path) -> int:
 
 def checkpoints(folder: str | os.PathLike[str]) -> list[Path]:
     """List the files ``checkpoint-<step>`` of a folder, oldest first."""
-    files = [path for path in Path(folder).glob("checkpoint-*") if re.fullmatch(r"checkpoint-\d+", path.name)]
+    found = [path for path in Path(folder).glob("checkpoint-*") if re.fullmatch(r"checkpoint-\d+", path.name)]
+    files = [path for path in found if path.is_file()]
     return sorted(files, key=checkpoint_step)
 
 

@@ -21,7 +21,7 @@ def locked(folder: Path, patience: float = 5.0) -> AcquireReturnProxy[FileLock]:
     :raises BlockingIOError: If another process still holds it then
     """
     try:
-        return FileLock(folder.resolve() / ".lock", is_singleton=True).acquire(patience)
+        return FileLock(folder.resolve() / ".lock", is_singleton=True, thread_local=False).acquire(patience)
     except Timeout:
         raise BlockingIOError(f"another process is using {folder}; end it, or wait for it") from None
 

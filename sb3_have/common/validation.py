@@ -191,8 +191,12 @@ def cast_observation(
     :param space: Observation space
     """
     if isinstance(space, spaces.Dict):
-        return {key: cast_observation(observation[key], subspace) for key, subspace in space.spaces.items()}  # type: ignore[misc]
-    array = np.asarray(observation).astype(space.dtype, copy=False)
+        subspaces = space.spaces
+        return {key: cast_observation(value, subspaces[key]) for key, value in observation.items() if key in subspaces}  # type: ignore[misc, union-attr]
+    array = np.asarray(observation)
+    if len(space.shape or ()) == 3:  # an image, which check_observation checks
+        return array
+    array = array.astype(space.dtype, copy=False)
     return array.reshape(space.shape) if array.size == np.prod(space.shape or ()) else array
 
 

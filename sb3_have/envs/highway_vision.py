@@ -52,7 +52,8 @@ class HighwayVisionEnv(AbstractEnv):
     stored as 128 + count), ``depth`` (C=1, logarithmic). Action: ``Box(-1, 1, (2,))``, [throttle, steer]. Throttle is
     mapped to +-5 m/s^2; positive steer turns right. Reward per step::
 
-        v_s / max_speed - steer_cost * |steer| - brake_cost * max(0, -throttle) - crash_penalty * (crashed or off road)
+        v_s / max_speed - steer_cost * abs(steer) - brake_cost * max(0, -throttle)
+        - crash_penalty * (crashed or off road)
 
     where v_s is the mean speed along the road during the step [m/s]. A crash or leaving the road terminates the
     episode, ``max_episode_steps`` truncates it. ``info`` holds, after the reset and every step, ``distance`` (sum of
@@ -94,7 +95,7 @@ class HighwayVisionEnv(AbstractEnv):
     :param policy_frequency: Control steps per second.
     :param steering_range: Steering angle at full lock in rad.
     :param max_speed: Top speed of the ego vehicle in m/s. The car does not reverse.
-    :param steer_cost: Weight of |steer| in the reward.
+    :param steer_cost: Weight of abs(steer) in the reward.
     :param brake_cost: Weight of braking in the reward.
     :param crash_penalty: Penalty for a crash or for leaving the road.
     :param event: Options of the event camera, see :class:`sb3_have.envs.vision.VisionSensors`.

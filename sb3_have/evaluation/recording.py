@@ -91,6 +91,8 @@ def record_episode(
     :raises ValueError: If the environment's observations do not fit the model
     :raises TypeError: If ``env`` is vectorized, or ``weather`` or ``env_kwargs`` are given with an environment
     """
+    if max_steps is not None and max_steps < 1:
+        raise ValueError(f"max_steps={max_steps}: expected a whole number >= 1, or None for the whole episode")
     keywords = {**(env_kwargs or {}), **({} if weather is None else {"weather": weather})}
     made = _make(env, keywords, render)
     try:

@@ -51,7 +51,18 @@ CLASSES: dict[str, type[Any]] = {
         "sb3_contrib.tqc": (tqc.TQCPolicy, tqc.CnnPolicy, tqc.MultiInputPolicy),
         "stable_baselines3.sac": (sac.SACPolicy, sac.CnnPolicy, sac.MultiInputPolicy),
         "stable_baselines3": (CombinedExtractor, FlattenExtractor, NatureCNN),
-        "torch.nn": (nn.ReLU, nn.Tanh, nn.ELU, nn.GELU, nn.SiLU, nn.Mish, nn.LeakyReLU, nn.Softplus, nn.Sigmoid),
+        "torch.nn": (
+            nn.Identity,
+            nn.ReLU,
+            nn.Tanh,
+            nn.ELU,
+            nn.GELU,
+            nn.SiLU,
+            nn.Mish,
+            nn.LeakyReLU,
+            nn.Softplus,
+            nn.Sigmoid,
+        ),
         "torch.optim": (optim.Adam, optim.AdamW, optim.Adamax, optim.NAdam, optim.RAdam, optim.RMSprop, optim.SGD),
     }.items()
     for kind in kinds
@@ -153,6 +164,8 @@ def _n_stack(model: BaseAlgorithm | BasePolicy) -> int | None:
 
 def _to_json(value: Any) -> Any:
     """Convert to JSON types: classes become ``{"$class": name}``, other objects ``{"$object": type}``."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return {"$float": str(value)}
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.generic):
@@ -172,7 +185,9 @@ def _from_json(value: Any, place: str) -> Any:
         return [_from_json(item, f"{place}[{i}]") for i, item in enumerate(value)]
     if not isinstance(value, dict):
         return value
-    if not value.keys() & {"$class", "$object"}:
+    if value.get("$float") in ("inf", "-inf", "nan"):
+        return float(value["$float"])
+    if not value.keys() & {"$class", "$object", "$float"}:
         return {key: _from_json(item, f"{place}[{key!r}]") for key, item in value.items()}
     if value.get("$class") not in CLASSES:
         raise ValueError(
@@ -211,7 +226,7 @@ def _space_from_json(value: Any, place: str) -> spaces.Space[Any]:
 
 def _box_from_json(value: Any) -> spaces.Box:
     dtype = np.dtype(value["dtype"])
-    if value["type"] != "Box" or dtype.kind not in "biuf":
+    if value["type"] != "Box" or dtype.kind not in "biuf" or dtype.itemsize > 8:
         raise ValueError(f"expected a Box of numbers, got a {value['type']} of dtype {value['dtype']}")
     low, high = (np.broadcast_to(np.asarray(value[name], dtype), value["shape"]) for name in ("low", "high"))
     return spaces.Box(low, high, dtype=dtype.type)

@@ -87,6 +87,19 @@ class DeepMDP(AuxiliaryLoss):
         }
 
 
+def draw_as_deepmdp(n_modalities: int, features_dim: int, action_dim: int, hidden_dim: int = 256) -> None:
+    """Draw as many random numbers as the initialization of :class:`DeepMDP` does."""
+    n_fused = n_modalities * features_dim
+    for n_nets, n_inputs, n_outputs in (
+        (n_modalities, features_dim + action_dim, features_dim),
+        (1, n_fused + action_dim, n_fused),
+        (1, n_fused + action_dim, 1),
+    ):
+        for n_in, n_out in ((n_inputs, hidden_dim), (hidden_dim, n_outputs)):
+            th.rand(n_nets, n_in, n_out)
+            th.rand(n_nets, 1, n_out)
+
+
 class AuxiliaryLossCallback(BaseCallback):
     """
     Callback for setting the coefficients of auxiliary losses, when training starts and at every step.

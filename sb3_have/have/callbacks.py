@@ -92,6 +92,7 @@ class ModalityWeightsCallback(BaseCallback):
         )
         self._weigh: Callable[[Any], Mapping[str, np.ndarray]] | None = None
         self._readings: dict[str, deque[np.ndarray]] = {}
+        self._names: dict[str, str] = {}
 
     def _init_callback(self) -> None:
         if not hasattr(self.model, "modality_weights"):
@@ -136,10 +137,11 @@ class ModalityWeightsCallback(BaseCallback):
             for name, weights in self._weigh(self.model._last_obs).items():
                 self._readings.setdefault(name, deque(maxlen=self.window)).append(weights)
         # Record at every step, because the logger may be dumped at any time
-        names = log_names(self._readings, 26)
+        if self._names.keys() != self._readings.keys():
+            self._names = log_names(self._readings, 26)
         for name, readings in self._readings.items():
             latest = np.concatenate(readings)
-            self.logger.record(f"have/weight_{names[name]}", float(latest.mean()))
+            self.logger.record(f"have/weight_{self._names[name]}", float(latest.mean()))
             if self._tensorboard:
                 self.logger.record(f"have/weights_{name}", latest, exclude=NOT_TEXT)
         if self._episode_is_due():

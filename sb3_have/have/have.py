@@ -172,12 +172,15 @@ class HAVESAC(SAC):
         device: th.device | str = "auto",
         _init_setup_model: bool = True,
     ):
+        given_policy_kwargs = dict(policy_kwargs or {})
         if env is not None:
             env = maybe_make_env(env, verbose)
             check_action_space(env.action_space)
         # SB3 does not accept NumPy's integers here
-        frequency, *unit = train_freq if isinstance(train_freq, tuple) else (train_freq,)
-        train_freq = (int(frequency), *unit) if unit else int(frequency)  # type: ignore[assignment]
+        if isinstance(train_freq, np.integer):
+            train_freq = int(train_freq)
+        elif isinstance(train_freq, tuple) and isinstance(train_freq[0], np.integer):
+            train_freq = (int(train_freq[0]), train_freq[1])
         super().__init__(
             policy,
             env,  # type: ignore[arg-type]
@@ -202,12 +205,14 @@ class HAVESAC(SAC):
             use_sde_at_warmup=use_sde_at_warmup,
             stats_window_size=stats_window_size,
             tensorboard_log=tensorboard_log,
-            policy_kwargs=policy_kwargs,
+            policy_kwargs=dict(given_policy_kwargs),
             verbose=verbose,
             seed=seed,
             device=device,
             _init_setup_model=False,
         )
+        # SB3 has written into the dictionary that it got
+        self.policy_kwargs = given_policy_kwargs
         self.value_estimation = value_estimation
         self.refusion = refusion
         self.auxiliary = auxiliary
@@ -283,7 +288,10 @@ class HAVESAC(SAC):
         own = {name: value for name, value in own.items() if value is not None}
         for name, value in own.items():
             if self.policy_kwargs.get(name, value) != value:
-                raise ValueError(f"{name}={value!r}, but policy_kwargs has {self.policy_kwargs[name]!r}: give it once.")
+                raise ValueError(
+                    f"policy_kwargs has {name}={self.policy_kwargs[name]!r}, but HAVESAC's argument of that name"
+                    f"{' (auxiliary)' if name == 'auxiliary_losses' else ''} is {value!r}: give it once."
+                )
         # `load` overwrites attributes of a saved model by its keyword arguments
         if self._architecture is not None and own != self._architecture:
             changed = [name for name in own | self._architecture if own.get(name) != self._architecture.get(name)]
@@ -292,7 +300,7 @@ class HAVESAC(SAC):
                 f"saved with {self._architecture}."
             )
         self._architecture = own
-        return {**self.policy_kwargs, **own}
+        return {**self.policy_kwargs, **own, "use_sde": self.use_sde}
 
     def train(self, gradient_steps: int, batch_size: int = 64) -> None:
         # Switch to train mode (this affects batch norm / dropout)
@@ -415,8 +423,9 @@ class HAVESAC(SAC):
                 setattr(self.actor.action_dist, name, None)
 
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        self.logger.record("train/ent_coef", self._mean(ent_coefs))
-        self.logger.record("train/critic_loss", self._mean(critic_losses))
+        if critic_losses:
+            self.logger.record("train/ent_coef", self._mean(ent_coefs))
+            self.logger.record("train/critic_loss", self._mean(critic_losses))
         if actor_losses:
             self.logger.record("train/actor_loss", self._mean(actor_losses))
         if ent_coef_losses:
@@ -432,7 +441,7 @@ class HAVESAC(SAC):
 
     def dump_logs(self) -> None:
         for name, value in self.logger.name_to_value.items():
-            if isinstance(value, th.Tensor):
+            if isinstance(value, th.Tensor) and value.dim() == 0:
                 self.logger.name_to_value[name] = value.item()
         super().dump_logs()
 

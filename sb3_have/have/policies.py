@@ -16,7 +16,7 @@ from torch.distributions import Normal
 
 from sb3_have.common.encoders import MultiModalEncoder
 from sb3_have.common.validation import check_observation
-from sb3_have.have.auxiliary import AuxiliaryLoss, DeepMDP
+from sb3_have.have.auxiliary import AuxiliaryLoss, draw_as_deepmdp
 from sb3_have.have.critic import MultiModalCritic
 
 SelfGaussian = TypeVar("SelfGaussian", bound="SquashedGaussian")
@@ -145,11 +145,10 @@ class MultiModalPolicy(SACPolicy):
                 f"auxiliary losses {list(self.auxiliary_losses)}: more than one has the terms {sorted(doubled)}; "
                 "rename them."
             )
-        # DeepMDP's heads are always created first, even if they are not used, so that the same seed gives the same
-        # initial actor with and without auxiliary losses
-        losses: dict[str, type[AuxiliaryLoss]] = {"deepmdp": DeepMDP, **self.auxiliary_losses}
-        heads = {name: loss_class(*sizes) for name, loss_class in losses.items()}
-        self.auxiliary = nn.ModuleDict({name: heads[name] for name in self.auxiliary_losses})
+        # The same seed gives the same initial actor with and without DeepMDP
+        if "deepmdp" not in self.auxiliary_losses:
+            draw_as_deepmdp(*sizes)
+        self.auxiliary = nn.ModuleDict({name: loss_class(*sizes) for name, loss_class in self.auxiliary_losses.items()})
 
         self.actor = self.make_actor()
         self.actor.optimizer = self._make_optimizer(list(self.actor.parameters()), lr_schedule)
@@ -228,7 +227,8 @@ class SquashedGaussian(SquashedDiagGaussianDistribution):
     """SB3's distribution without PyTorch's check for NaN on a GPU, which would synchronise it in every step."""
 
     def proba_distribution(self: SelfGaussian, mean_actions: th.Tensor, log_std: th.Tensor) -> SelfGaussian:
-        self.distribution = Normal(mean_actions, log_std.exp(), validate_args=mean_actions.device.type == "cpu")
+        validate_args = None if mean_actions.device.type == "cpu" else False
+        self.distribution = Normal(mean_actions, log_std.exp(), validate_args=validate_args)
         return self
 
 

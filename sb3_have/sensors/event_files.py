@@ -59,7 +59,7 @@ class EventFile:
             self.group = self._find(group)
             self._columns = {name: self._file[self.group][name] for name in "xytp"}
             self._check_columns()
-            stated = self._resolution()
+            stated = self._resolution() if height is None or width is None else (height, width)
             self.height = stated[0] if height is None else height
             self.width = stated[1] if width is None else width
             # Seconds to add to the times to get the clock of the other sensors

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import zlib
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -256,7 +257,8 @@ def _sensor_of(space: spaces.Box, key: str, sensor: str | None) -> str:
             f"{space.dtype} {space.shape} in {space.low.min()}..{space.high.max()}; use ChannelLastImages inside of "
             "SensorFailure, and stack frames outside of it"
         )
-    named = [name for name in ("rgb", "event", "depth") if name in key.lower()]
+    # Names count at the start of a word: "seventh" is no event camera
+    named = [name for name in ("rgb", "event", "depth") if re.search(rf"(?<![a-z]){name}", key.lower())]
     if sensor is None and len(named) > 1:
         raise ValueError(f"observation key {key!r} names several sensors; give sensor=, one of {SENSORS[:3]}")
     return sensor or (named[0] if named else "rgb")
