@@ -35,6 +35,7 @@ def install(monkeypatch: pytest.MonkeyPatch, *servers: Server) -> None:
     # Callbacks, traffic managers and what the module remembers belong to the process
     monkeypatch.setattr(TrafficManager, "_of_this_process", [])
     monkeypatch.setattr(session, "_tm_ports", set())
+    monkeypatch.setattr(session, "_servers", set())
     monkeypatch.setattr(session, "_lost_with_traffic", [])
     for server in servers:
         server.traffic_managers.clear()

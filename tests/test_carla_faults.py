@@ -346,8 +346,8 @@ def test_a_server_that_a_dead_client_left_synchronous(
 def test_two_environments_on_one_server(server: Server, env: CarlaVisionEnv) -> None:
     env.reset()
     actors = set(server.actors)
-    second = CarlaVisionEnv(**SMALL, tm_port=8001)
-    with pytest.raises(RuntimeError, match=r"synchronous.*port=\.\.\., tm_port=\.\.\."):
+    second = CarlaVisionEnv(**SMALL, tm_port=8001, take_over=True)
+    with pytest.raises(RuntimeError, match=r"already drives.*port=\.\.\., tm_port=\.\.\."):
         second.reset()
     second.close()
     assert set(server.actors) == actors and env.step(FULL)[4]["distance"] > 0

@@ -62,10 +62,12 @@ def save_checkpoint(
             "this checkpoint begins new episodes; everything else is exact.",
             stacklevel=2,
         )
+    buffer = model.replay_buffer
+    assert buffer is not None  # for mypy
     state = {
         "algorithm": type(model),
         "environments": environments,
-        "replay_buffer": filled_part(model.replay_buffer),
+        "replay_buffer": filled_part(buffer),
         "callbacks": callbacks_state(callbacks),
         # Last, after everything that may draw
         "random": random_states(),

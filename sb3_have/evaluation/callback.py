@@ -79,7 +79,7 @@ class WeatherEvalCallback(BaseCallback):
             vec_env_cls=vec_env_cls,
         )
 
-        self._check = partial(check_environment, env_id, *weathers[:1], env_kwargs=env_kwargs, env_wrapper=env_wrapper)
+        self._check = partial(check_environment, env_id, next(iter(weathers), ""), env_kwargs, env_wrapper)
 
     def check(self) -> None:
         """

@@ -20,6 +20,8 @@ ROLE: Final = "sb3_have-"
 
 # Ports of the traffic managers of this process. CARLA identifies them by port only, whatever their server is.
 _tm_ports: set[int] = set()
+# Servers that this process drives: a second session would destroy the actors of the first one
+_servers: set[tuple[str, int]] = set()
 # Servers that were lost while their traffic manager was running. It consists of threads of this process that cannot be
 # stopped any more. Every tick of any world, and every change of settings, runs them and would abort the process.
 _lost_with_traffic: list[str] = []
@@ -78,6 +80,14 @@ class Session:
         :raises ValueError: If the server does not have the map
         """
         _check_traffic_managers()
+        server = (self.host, self.port)
+        if server in _servers:
+            raise RuntimeError(
+                f"this process already drives the CARLA server at {self.where}; give every environment a server of its "
+                "own (port=..., tm_port=...)"
+            )
+        _servers.add(server)
+        self._undo.append(lambda: _servers.discard(server))
         try:
             self.client = carla.Client(self.host, self.port)
             self.client.set_timeout(self.timeout)
@@ -254,6 +264,7 @@ class Session:
         self.lost = True
         if self._stop_traffic_manager in self._undo:
             _lost_with_traffic.append(self.where)
+        _servers.discard((self.host, self.port))
         self._undo.clear()
 
     def _alive(self) -> bool:
