@@ -183,8 +183,9 @@ class Run:
             stop,
             self._make_evaluation(seconds_before=self.seconds, progress_bar=progress_bar),
         ]
+        saving = ResumableCheckpointCallback(self.out, self.save_freq, info=self._info)
         if keep_checkpoint:
-            callbacks.insert(0, ResumableCheckpointCallback(self.out, self.save_freq, info=self._info))
+            callbacks.insert(0, saving)
         callbacks += make_callbacks(self.config)
 
         if checkpoint is None:
@@ -205,6 +206,7 @@ class Run:
         finally:
             self.seconds += time.monotonic() - self._started
             logger.close()
+            saving.release()
         self.interrupted = stop.interrupted
         write_atomically(self.out / "model.zip", model.save)
         if (normalizer := model.get_vec_normalize_env()) is not None:

@@ -113,3 +113,18 @@ def test_goals_are_cut_without_warning() -> None:
         warnings.simplefilter("error")
         end_last_episode(model.replay_buffer)  # type: ignore[arg-type]
     assert model.replay_buffer.dones[2] and model.replay_buffer.timeouts[2]  # type: ignore[union-attr]
+
+
+def test_rows_without_a_transition_are_not_saved(tmp_path: Path) -> None:
+    """SB3's buffers reserve all of `buffer_size`."""
+    model = sac(Drifting(), "MlpPolicy", buffer_size=200_000).learn(9)
+    save_checkpoint(model, tmp_path / "mine")
+    buffer: Any = model.replay_buffer
+    observations = buffer.observations.nbytes
+    assert observations > 1e6 and (tmp_path / "mine").stat().st_size < 200_000 * 16 + 3e6
+    loaded = load_checkpoint(tmp_path / "mine", Drifting())
+    buffers = [model.replay_buffer, loaded.replay_buffer]
+    for name in ("observations", "next_observations"):
+        ours, theirs = (getattr(buffer, name) for buffer in buffers)
+        np.testing.assert_array_equal(ours, theirs)
+    loaded.learn(20, reset_num_timesteps=False)

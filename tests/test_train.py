@@ -17,6 +17,7 @@ import pytest
 import torch as th
 import yaml
 from fake_drive import CONFIG, ENV_ID
+from gymnasium import spaces
 from resuming import assert_same, everything, leaves
 
 import sb3_have
@@ -24,7 +25,7 @@ from sb3_have import train
 from sb3_have.checkpoint import StopTrainingOnSignal, checkpoints, newest_checkpoint, save_checkpoint
 from sb3_have.checkpoint.files import locked
 from sb3_have.configuration import load_config, model_kwargs
-from sb3_have.evaluation import callback
+from sb3_have.evaluation import callback, saved_normalizer
 from sb3_have.train import Run, make_training_env
 
 
@@ -342,3 +343,31 @@ def test_evaluations_have_a_progress_bar(tmp_path: Path, progress_bar: bool, cap
     make_run(tmp_path).train(12, progress_bar=progress_bar)
     output = "".join(capfd.readouterr())
     assert ("2/2" in output and "episode" in output) == progress_bar
+
+
+def test_normalization_with_stacked_frames(tmp_path: Path) -> None:
+    """VecNormalize is the outermost wrapper, and its statistics are saved with the model."""
+    config: dict[str, Any] = {
+        "policy": "MultiInputPolicy",
+        "policy_kwargs": {"net_arch": [4], "features_dim": 4},
+        "learning_starts": 10,
+        "batch_size": 4,
+        "buffer_size": 100,
+        "normalize": True,
+        "frame_stack": 2,
+    }
+    model = Run(config, "ReliabilityDrive-v0", tmp_path, eval_freq=0, device="cpu").train(30)
+    normalizer = saved_normalizer(tmp_path / "vecnormalize.pkl")
+    assert normalizer is not None and isinstance(model.observation_space, spaces.Dict)
+    assert isinstance(normalizer.obs_rms, dict)
+    for key, space in model.observation_space.spaces.items():
+        assert normalizer.obs_rms[key].mean.shape == space.shape
+    resumed = Run(config, "ReliabilityDrive-v0", tmp_path, eval_freq=0, device="cpu").train(40)
+    assert resumed.num_timesteps == 40
+
+
+def test_wrong_keywords_of_the_evaluation_are_refused_before_the_training(tmp_path: Path) -> None:
+    run = Run(CONFIG, ENV_ID, tmp_path / "run", eval_freq=10, eval_env_kwargs={"image_sze": 48}, device="cpu")
+    with pytest.raises(ValueError, match=r"cannot be evaluated in the weather .*image_sze"):
+        run.train(20)
+    assert not (tmp_path / "run").exists()

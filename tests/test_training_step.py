@@ -310,3 +310,16 @@ print(faults[-1] - faults[0])
     if results["keep"].returncode == 3:
         pytest.skip("the C library has no mallopt")
     assert int(results["keep"].stdout) < 100 < int(results["default"].stdout), results
+
+
+def test_tensors_of_other_callbacks_stay_in_the_logger(monkeypatch: pytest.MonkeyPatch) -> None:
+    """SB3 writes them as histograms."""
+    model = tiny_model(vectors_space())
+    fill_buffer(model, 30)
+    model.train(1, 8)
+    model.logger.record("weights", th.ones(3))
+    dumped: dict[str, Any] = {}
+    monkeypatch.setattr(type(model.logger), "dump", lambda self, step: dumped.update(self.name_to_value))
+    model.start_time, model.ep_info_buffer, model.ep_success_buffer = 0, [], []  # type: ignore[assignment]
+    model.dump_logs()
+    assert th.equal(dumped["weights"], th.ones(3))

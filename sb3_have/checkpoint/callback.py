@@ -89,7 +89,7 @@ class ResumableCheckpointCallback(BaseCallback):
     def _refuse_later_checkpoints(self) -> None:
         for path in reversed(checkpoints(self.folder)):
             if checkpoint_step(path) > self._last_step and damage(path) is None:
-                self._release()
+                self.release()
                 raise ValueError(
                     f"{path} is later than this training, which has {self._last_step} steps. To resume from it, use "
                     "load_checkpoint and `learn(..., reset_num_timesteps=False)`; to start a new training, choose "
@@ -129,7 +129,7 @@ class ResumableCheckpointCallback(BaseCallback):
                 "so no checkpoint was saved.",
                 stacklevel=2,
             )
-        self._release()
+        self.release()
 
     def _save(self) -> None:
         """Save ``checkpoint-<step>``, unless it has just been saved, and remove old checkpoints."""
@@ -165,7 +165,8 @@ class ResumableCheckpointCallback(BaseCallback):
             noise["random"] = random_states()
         return noise
 
-    def _release(self) -> None:
+    def release(self) -> None:
+        """Unlock the folder. The callback does it at the end of a training, unless that failed."""
         if self._lock is not None:
             self._lock.release()
             self._lock = None

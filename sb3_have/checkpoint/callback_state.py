@@ -40,20 +40,20 @@ class Stateful(Protocol):
     def set_state(self, state: Any) -> None: ...
 
 
-def _flattened(callbacks: Callbacks) -> list[BaseCallback]:
+def flattened(callbacks: Callbacks) -> list[BaseCallback]:
     """List callbacks and the callbacks within them, as SB3's own nest them."""
     found: list[BaseCallback] = []
     for callback in [callbacks] if isinstance(callbacks, BaseCallback) else callbacks or ():
         children = [getattr(callback, name, None) for name in ("callback", "callback_on_new_best")]
         children += getattr(callback, "callbacks", [])
-        found += [callback, *_flattened([child for child in children if isinstance(child, BaseCallback)])]
+        found += [callback, *flattened([child for child in children if isinstance(child, BaseCallback)])]
     return found
 
 
 def callbacks_state(callbacks: Callbacks) -> list[tuple[str, dict[str, Any], Any]]:
     """Return class, attributes and own state of every callback."""
     states = []
-    for callback in _flattened(callbacks):
+    for callback in flattened(callbacks):
         names = [name for base in ATTRIBUTES if isinstance(callback, base) for name in ATTRIBUTES[base]]
         attributes = {name: getattr(callback, name) for name in names}
         own = callback.get_state() if isinstance(callback, Stateful) else None
@@ -64,7 +64,7 @@ def callbacks_state(callbacks: Callbacks) -> list[tuple[str, dict[str, Any], Any
 def restore_callbacks(callbacks: Callbacks, states: list[tuple[str, dict[str, Any], Any]]) -> None:
     """Restore callbacks from the states of those of the same class, in their order; others stay as they are."""
     waiting = list(states)
-    for callback in _flattened(callbacks):
+    for callback in flattened(callbacks):
         index = next((i for i, (name, *_) in enumerate(waiting) if name == type(callback).__qualname__), None)
         if index is None:
             continue

@@ -18,7 +18,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_have.checkpoint.archive import damage, read_archive, read_info, write_archive
-from sb3_have.checkpoint.callback_state import Callbacks, callbacks_state, restore_callbacks
+from sb3_have.checkpoint.callback_state import Callbacks, callbacks_state, flattened, restore_callbacks
 from sb3_have.checkpoint.env_state import environments_state, restore_environments
 from sb3_have.checkpoint.random_state import random_states, set_random_states
 from sb3_have.checkpoint.replay_state import at_full_size, filled_part
@@ -132,6 +132,12 @@ def load_checkpoint(
         model._last_obs = None
         end_last_episode(buffer)
     restore_callbacks(callbacks, state["callbacks"])
+    names = {type(callback).__name__ for callback in flattened(callbacks)}
+    if (model.action_noise is not None or model.use_sde) and "ResumableCheckpointCallback" not in names:
+        warnings.warn(
+            "Action noise and gSDE's noise are not restored: pass the ResumableCheckpointCallback to load_checkpoint.",
+            stacklevel=2,
+        )
     set_random_states(state["random"])
     return model
 

@@ -81,7 +81,8 @@ def environments_state(vec_env: VecEnv, shared: Any = None) -> EnvironmentsState
 
     :param vec_env: Environments with any wrappers
     :param shared: Other objects that may share parts with them
-    :return: The state; where it cannot be pickled, ``lost`` names the reason and only random generators are kept
+    :return: The state; where it cannot be pickled, ``lost`` names the reason, and only random
+        generators of environments in this process are kept
     """
     state, base = _capture(_vec_layers(vec_env), shared), vec_env.unwrapped
     if _are_resumable(base):

@@ -102,7 +102,8 @@ class HighwayVisionEnv(AbstractEnv):
     :param depth: Options of the depth camera, see :class:`sb3_have.envs.vision.VisionSensors`.
     :param render_mode: None or "rgb_array" (RGB, events and depth side by side).
     :param scenario: "highway", "merge" or "curves".
-    :param duration: Length of an episode in seconds; takes precedence over ``max_episode_steps``.
+    :param duration: Length of an episode in seconds; takes precedence over ``max_episode_steps``. ``gym.make`` limits
+        episodes to 500 steps (100 s) unless it is given a larger ``max_episode_steps``.
     :param config: Further options in a dict, as highway-env's environments accept them; they take precedence.
     :raises ValueError: If an option is unknown or out of range.
     """
