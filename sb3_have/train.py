@@ -65,7 +65,7 @@ VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {"dummy": DummyVe
 
 def make_training_env(env_id: str, config: Mapping[str, Any], out: Path | None = None) -> VecEnv:
     """
-    Make the environments of a configuration, wrapped as the Zoo wraps them.
+    Make the environments of a configuration, wrapped as in the Zoo, but with VecNormalize outside of VecFrameStack.
 
     :param env_id: Environment id
     :param config: Hyper-parameters; several environments (``n_envs``) run in processes of their own

@@ -152,7 +152,10 @@ def test_settings_of_an_environment_that_cannot_be_pickled() -> None:
 
 def test_other_environments_are_refused(tmp_path: Path) -> None:
     state = environments_state(make_vec_env())
-    with pytest.raises(ValueError, match=r"VecNormalize > DummyVecEnv > Monitor > TimeLimit > Drifting, and.*> Named"):
+    with pytest.raises(
+        ValueError,
+        match=r"VecNormalize > DummyVecEnv > Monitor > TimeLimit > Drifting, but the environment has.*> Named",
+    ):
         restore_environments(make_vec_env(Named), state)
     with pytest.raises(ValueError, match="saved with the wrappers"):
         restore_environments(make_vec_env(n_envs=2), state)

@@ -274,7 +274,7 @@ def test_keys_tell_the_sensor() -> None:
     [
         ("event", "event"), ("dvs_events", "event"), ("leftEvents", "event"), ("eventFrame", "event"),
         ("EVENT_1", "event"), ("depthmap", "depth"), ("front.depth", "depth"), ("leftRGB", "rgb"), ("rgbcam", "rgb"),
-        ("leftrgb", "rgb"), ("front", "rgb"),
+        ("leftrgb", "rgb"), ("front", "rgb"), ("seventh", "rgb"), ("prevention", "rgb"),
         ("event_depth", None), ("depth_rgb", None), ("RGBDepth", None),
     ],
 )  # fmt: skip

@@ -105,7 +105,7 @@ def test_records_of_others_are_not_removed(tmp_path: Path) -> None:
         others = tmp_path / name.removesuffix(".csv") / name
         others.parent.mkdir()
         others.write_text("of another program")
-        with pytest.raises(ValueError, match=f"{name} is of no run of this program; remove it, or choose another"):
+        with pytest.raises(ValueError, match=f"{name} was not written by this program; remove it, or choose another"):
             make_run(others.parent).train(8)
         assert others.read_text() == "of another program" and not (others.parent / "model.zip").exists()
     with acting_at(12, die), pytest.raises(MemoryError):
@@ -274,7 +274,7 @@ def test_checkpoint_of_another_program_is_refused(tmp_path: Path) -> None:
     model = make_run(tmp_path / "run").train(8)
     model.set_env(make_training_env(ENV_ID, CONFIG))
     save_checkpoint(model, tmp_path / "checkpoint-8")
-    with pytest.raises(ValueError, match="of a run with None, not"):
+    with pytest.raises(ValueError, match="belongs to a run with None, not"):
         make_run(tmp_path).train(12)
 
 

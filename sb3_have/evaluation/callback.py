@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_have.checkpoint.files import write_atomically
 from sb3_have.checkpoint.random_state import same_random_numbers
-from sb3_have.checkpoint.stopping import handle_signals, stop_training
+from sb3_have.checkpoint.stopping import StopTrainingOnSignal, handle_signals, stop_training
 from sb3_have.evaluation.evaluation import check_environment, evaluate
 
 # The same for all runs, so that their evaluations drive the same episodes
@@ -135,9 +135,12 @@ class WeatherEvalCallback(BaseCallback):
         except KeyboardInterrupt:
             if not signals:
                 raise
-            # Pass the signal on to the handler that was there before
+            # Pass the signal on to the handler that was there before; if it does not end training, raise
+            handler = signal.getsignal(signals[0])
             signal.raise_signal(signals[0])
-            return False
+            if isinstance(getattr(handler, "__self__", None), StopTrainingOnSignal):
+                return False
+            raise
         self._last_step = step
         return True
 

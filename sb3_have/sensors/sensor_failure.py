@@ -258,7 +258,8 @@ def _sensor_of(space: spaces.Box, key: str, sensor: str | None) -> str:
             "SensorFailure, and stack frames outside of it"
         )
     # Names count at the start of a word: "seventh" is no event camera
-    named = [name for name in ("rgb", "event", "depth") if re.search(rf"(?<![a-z]){name}", key.lower())]
+    words = [word.lower() for word in re.findall(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+", key)]
+    named = [name for name in ("rgb", "event", "depth") if any(word.startswith(name) for word in words)]
     if sensor is None and len(named) > 1:
         raise ValueError(f"observation key {key!r} names several sensors; give sensor=, one of {SENSORS[:3]}")
     return sensor or (named[0] if named else "rgb")
