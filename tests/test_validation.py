@@ -329,3 +329,21 @@ def test_training_with_long_names(capsys: pytest.CaptureFixture[str]) -> None:
     )
     model.learn(60, ModalityWeightsCallback())
     assert "weight_front_left" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("change", ["n_envs", "image", "n_stack", "actions"])
+def test_a_replay_buffer_of_another_environment_is_refused(tmp_path: Path, change: str) -> None:
+    def make(size: int = 36, n_envs: int = 1, n_stack: int = 1, action_dim: int = 2) -> HAVESAC:
+        space = spaces.Dict({"rgb": box((size, size, 3)), "state": vector(3)})
+        env: Any = DummyVecEnv([lambda: RandomSensors(space, action_dim=action_dim)] * n_envs)
+        return tiny_model(space, env=VecFrameStack(env, n_stack) if n_stack > 1 else env)
+
+    make().learn(12).save_replay_buffer(tmp_path / "buffer")
+    changes: dict[str, Any] = {"n_envs": {"n_envs": 2}, "image": {"size": 40}, "n_stack": {"n_stack": 2}}
+    other = make(**changes.get(change, {"action_dim": 3}))
+    with pytest.raises(ValueError, match=r"the replay buffer in .* has"):
+        other.load_replay_buffer(tmp_path / "buffer")
+    other.learn(12)
+    same = make()
+    same.load_replay_buffer(tmp_path / "buffer")
+    same.learn(12)

@@ -576,7 +576,23 @@ class HAVESAC(SAC):
         :param truncate_last_traj: Whether the last trajectory ends where the buffer was saved. Use False if the
             environment continues from there.
         """
+        before = self.replay_buffer
         super().load_replay_buffer(path, truncate_last_traj)
+        loaded = self.replay_buffer
+        assert loaded is not None
+        expected = {
+            "observation_space": self.observation_space,
+            "action_space": self.action_space,
+            "n_envs": self.n_envs,
+            "n_stack": self.n_stack,
+        }
+        for name, value in expected.items():
+            if getattr(loaded, name, value) != value:
+                self.replay_buffer = before
+                raise ValueError(
+                    f"the replay buffer in {path} has {name} {getattr(loaded, name)}, the model {value}: load it "
+                    "into a model with the same environments."
+                )
         if isinstance(self.replay_buffer, ModalityReplayBuffer):
             kwargs = self._replay_buffer_kwargs()
             self.replay_buffer.n_steps, self.replay_buffer.gamma = kwargs["n_steps"], kwargs["gamma"]
