@@ -40,7 +40,7 @@ STYLES = {
     "event": Style("#0072B2", marker="^", hatch="---"),
     "depth": Style("#009E73", marker="v", hatch="|||"),
     "sac": Style("#888888", marker="D", hatch="xxx"),
-    "concat": Style("#888888", marker="D", hatch="xxx"),
+    "concat": Style("#888888", ":", "D", "..."),
     "deepmdp": Style("#56B4E9", marker="P"),
     "gve": Style("#56B4E9", "--", "p", "///"),
     "gve-wide": Style("#E69F00", marker="X", hatch="+++"),

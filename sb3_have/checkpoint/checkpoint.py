@@ -132,8 +132,10 @@ def load_checkpoint(
         model._last_obs = None
         end_last_episode(buffer)
     restore_callbacks(callbacks, state["callbacks"])
-    names = {type(callback).__name__ for callback in flattened(callbacks)}
-    if (model.action_noise is not None or model.use_sde) and "ResumableCheckpointCallback" not in names:
+    given = {type(callback).__qualname__ for callback in flattened(callbacks)}
+    saved_by = {name for name, *_ in state["callbacks"]}
+    has_noise = model.action_noise is not None or model.use_sde
+    if has_noise and "ResumableCheckpointCallback" in saved_by - given:
         warnings.warn(
             "Action noise and gSDE's noise are not restored: pass the ResumableCheckpointCallback to load_checkpoint.",
             stacklevel=2,
