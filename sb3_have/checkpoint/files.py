@@ -1,4 +1,4 @@
-"""Files and folders that several processes share, any of which may die at any moment."""
+"""Locked folders and atomic writes, for files that several processes share."""
 
 from __future__ import annotations
 
