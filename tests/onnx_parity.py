@@ -18,13 +18,15 @@ N_OBSERVATIONS = 1000
 
 
 def observations(space: spaces.Space[Any], n: int = N_OBSERVATIONS, seed: int = 0) -> Observations:
-    """Random bytes between random bounds for images, zeros ("no data") among them; vectors from their space."""
+    """Random bytes between random bounds for images, zeros ("no data") among them; others from their space."""
     rng = np.random.default_rng(seed)
     boxes = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
     found = {}
     for key, box in boxes.items():
-        assert isinstance(box, spaces.Box)
-        if box.dtype == np.uint8:
+        if not isinstance(box, spaces.Box):
+            box.seed(seed)
+            found[key] = np.stack([box.sample() for _ in range(n)])
+        elif box.dtype == np.uint8:
             low, high = np.sort(rng.integers(0, 257, (2, n, *[1] * len(box.shape))), axis=0)
             images = rng.integers(low, np.maximum(high, low + 1), (n, *box.shape))
             found[key] = np.minimum(images, 255).astype(np.uint8)

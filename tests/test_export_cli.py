@@ -6,7 +6,6 @@ from typing import Any
 import numpy as np
 import pytest
 from envs import RandomSensors, tiny_model, vector, vectors_space
-from gymnasium import spaces
 from onnx_parity import metadata
 from sb3_contrib import TQC
 from stable_baselines3 import PPO, SAC
@@ -61,9 +60,6 @@ def test_wrong_files(tmp_path: Path, zipped: Path) -> None:
     assert "ppo.zip" in run(tmp_path / "ppo.zip", *to_onnx)
     assert "model.zip was saved by havesac, not by tqc" in run(zipped, *to_onnx, "--algo", "tqc")
     assert f"File exists: '{zipped}'" in run(zipped, "--format", "safetensors", "--out", zipped)
-    sac = SAC("MultiInputPolicy", RandomSensors(spaces.Dict({"a": vector(2), "b": spaces.Discrete(2)})), buffer_size=50)
-    sac.save(zipped)
-    assert "only Box spaces and Dicts of them can be exported" in run(zipped, "--format", "safetensors")
     (tmp_path / "policy").mkdir()
     assert "only a zip can be exported as safetensors" in run(tmp_path / "policy", "--format", "safetensors")
     assert not (tmp_path / "out").exists()

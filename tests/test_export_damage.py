@@ -95,7 +95,17 @@ CONFIG: dict[str, tuple[Damage, str]] = {
     "action bounds": (set_in("action_space", "low", value=[1, 2, 3]), "action_space is damaged"),
     "action dtype": (set_in("action_space", "dtype", value="object"), "action_space is damaged: .*dtype object"),
     "huge dtype": (set_in("action_space", "dtype", value="V2000000000"), "action_space is damaged: .*dtype V2"),
-    "action type": (set_in("action_space", "type", value="Discrete"), "action_space is damaged: .*got a Discrete"),
+    "action type": (
+        set_in("action_space", value={"type": "Discrete", "n": 3, "start": 0}),
+        "expected a Box, got Discr",
+    ),
+    "space type": (set_in("action_space", "type", value="Text"), "action_space is damaged: unknown space Text"),
+    "space of choices": (set_in("observation_space", value={"type": "Discrete", "n": 0, "start": 0}), "is damaged"),
+    "huge space of choices": (
+        set_in("observation_space", value={"type": "Discrete", "n": 10**12, "start": 0}),
+        "cannot build the policy",
+    ),
+    "huge space of bits": (set_in("observation_space", value={"type": "MultiBinary", "n": 10**12}), "cannot build"),
     "keys": (set_in("observation_space", "spaces", value=[["a"]]), "observation_space is damaged"),
     "unknown mark": (set_in("policy_kwargs", "net_arch", value={"$file": "x"}), "net_arch"),
 }

@@ -146,9 +146,6 @@ def test_other_algorithms_on_these_encoders(tmp_path: Path, algorithm: Any, spac
 def test_algorithms_of_other_policies_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"HAVESAC, SAC, TQC or CrossQ, got ActorCriticPolicy"):
         export_safetensors(PPO("MlpPolicy", RandomSensors(vector(3)), device="cpu"), tmp_path)
-    space = spaces.Dict({"a": vector(2), "b": spaces.Discrete(3)})
-    with pytest.raises(ValueError, match=r"only Box spaces and Dicts of them can be exported, got Discrete\(3\)"):
-        export_safetensors(SAC("MultiInputPolicy", RandomSensors(space), buffer_size=50), tmp_path)
 
 
 def test_a_loaded_policy_is_exported_again(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import FrameStackObservation
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from onnx_parity import assert_parity, enliven
 from stable_baselines3 import SAC, HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.envs import BitFlippingEnv
@@ -21,6 +22,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 from sb3_have import HAVESAC, ModalityReplayBuffer, ModalityWeightsCallback
 from sb3_have.common.encoders import MultiModalEncoder, one_hot
 from sb3_have.common.log_names import log_names
+from sb3_have.export import export_onnx, export_safetensors, load_policy
 from sb3_have.have import AuxiliaryLoss
 from sb3_have.have.auxiliary import LatentTransitions
 
@@ -134,6 +136,22 @@ def test_discrete_and_other_vectors_share_a_modality() -> None:
     assert encoder.modalities["all"].space.shape == (8,)
     features = encoder({"gear": th.tensor([0, 4]), "state": th.zeros(2, 3)})
     assert features.shape == (2, 1, 4) and not th.equal(features[0], features[1])
+
+
+@pytest.mark.parametrize("space", DISCRETE, ids=str)
+def test_discrete_observations_are_exported(space: spaces.Space[Any], tmp_path: Path) -> None:
+    model = tiny_model(spaces.Dict({"gear": space, "state": vector(3)}))
+    enliven(model.policy)
+    export_safetensors(model, tmp_path / "policy")
+    policy = load_policy(tmp_path / "policy", "cpu")
+    assert policy.observation_space == model.observation_space
+    export_onnx(policy, tmp_path / "policy.onnx")
+    assert_parity(tmp_path / "policy.onnx", model.policy)
+
+
+def test_matrices_of_choices_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"'gear': expected a MultiDiscrete of one axis"):
+        tiny_model(spaces.Dict({"gear": spaces.MultiDiscrete([[2, 3], [2, 2]])}))
 
 
 def test_a_single_discrete_observation() -> None:

@@ -65,6 +65,8 @@ def _as_box(key: str, space: spaces.Space[Any], normalize_images: bool, channels
     if isinstance(space, spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary):
         if isinstance(space, spaces.MultiBinary):
             _check_matrix(where, space)
+        if isinstance(space, spaces.MultiDiscrete) and len(space.shape) > 1:  # as in SB3
+            raise ValueError(f"{where}: expected a MultiDiscrete of one axis, got {space}; flatten it in a wrapper.")
         return spaces.Box(0.0, 1.0, (get_flattened_obs_dim(space),), np.float32)
     if not isinstance(space, spaces.Box):
         raise ValueError(

@@ -138,6 +138,8 @@ def build(
             kwargs[name] = _from_json(value, f"policy_kwargs[{name!r}]")
     observation_space = _space_from_json(config["observation_space"], "observation_space")
     action_space = _space_from_json(config["action_space"], "action_space")
+    if not isinstance(action_space, spaces.Box):
+        raise ValueError(f"action_space is damaged: expected a Box, got {action_space}")
 
     # The arguments must not exhaust the memory: count parameters before their values are initialized
     left = 2 * size
@@ -201,8 +203,14 @@ def _space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
     """Convert to JSON types: equal bounds become a single number, infinite ones "inf" and "-inf"."""
     if isinstance(space, spaces.Dict):
         return {"type": "Dict", "spaces": [[key, _space_to_json(item)] for key, item in space.spaces.items()]}
+    if isinstance(space, spaces.Discrete):
+        return {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
+    if isinstance(space, spaces.MultiDiscrete):
+        return {"type": "MultiDiscrete", "nvec": space.nvec.tolist(), "start": space.start.tolist()}
+    if isinstance(space, spaces.MultiBinary):
+        return {"type": "MultiBinary", "n": space.n if isinstance(space.n, int) else list(space.n)}
     if not isinstance(space, spaces.Box):
-        raise ValueError(f"only Box spaces and Dicts of them can be exported, got {space}")
+        raise ValueError(f"expected a Box, Discrete, MultiDiscrete, MultiBinary or a Dict of them, got {space}")
     bounds = {}
     for name, bound in (("low", space.low), ("high", space.high)):
         same = bound.size > 0 and (bound == bound.flat[0]).all()
@@ -214,19 +222,33 @@ def _space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
 def _space_from_json(value: Any, place: str) -> spaces.Space[Any]:
     """Reverse :func:`_space_to_json`; ``place`` names the space in the error."""
     try:
-        boxes = value["spaces"] if value["type"] == "Dict" else [["", value]]
-        if sum(math.prod(map(abs, box["shape"])) for _, box in boxes) > MAX_SIZE:
+        parts = value["spaces"] if value["type"] == "Dict" else [["", value]]
+        if sum(math.prod(map(abs, part.get("shape", ()))) for _, part in parts) > MAX_SIZE:
             raise ValueError(f"more than {MAX_SIZE} numbers")
         # Gymnasium sorts the keys of a plain dict
-        found: dict[str, spaces.Space[Any]] = OrderedDict((str(key), _box_from_json(box)) for key, box in boxes)
+        found: dict[str, spaces.Space[Any]] = OrderedDict((str(key), _part_from_json(part)) for key, part in parts)
     except Exception as error:  # whatever a damaged file leads to
         raise ValueError(f"{place} is damaged: {error}") from error
     return spaces.Dict(found) if value["type"] == "Dict" else found[""]
 
 
+def _part_from_json(value: Any) -> spaces.Space[Any]:
+    match value["type"]:
+        case "Discrete":
+            return spaces.Discrete(value["n"], start=value["start"])
+        case "MultiDiscrete":
+            return spaces.MultiDiscrete(value["nvec"], start=value["start"])
+        case "MultiBinary":
+            return spaces.MultiBinary(value["n"])
+        case "Box":
+            return _box_from_json(value)
+        case kind:
+            raise ValueError(f"unknown space {kind}")
+
+
 def _box_from_json(value: Any) -> spaces.Box:
     dtype = np.dtype(value["dtype"])
-    if value["type"] != "Box" or dtype.kind not in "biuf" or dtype.itemsize > 8:
-        raise ValueError(f"expected a Box of numbers, got a {value['type']} of dtype {value['dtype']}")
+    if dtype.kind not in "biuf" or dtype.itemsize > 8:
+        raise ValueError(f"expected a Box of numbers, got dtype {value['dtype']}")
     low, high = (np.broadcast_to(np.asarray(value[name], dtype), value["shape"]) for name in ("low", "high"))
     return spaces.Box(low, high, dtype=dtype.type)

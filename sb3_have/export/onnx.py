@@ -164,15 +164,17 @@ def _to_onnx(network: _Network, metadata: dict[str, str]) -> bytes:
 
 def _sample(space: spaces.Space[Any], batch_size: int) -> dict[str, np.ndarray]:
     """Sample observations by input name, without using the space's own random numbers."""
-    boxes: dict[str, Any] = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
+    parts: dict[str, Any] = space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
     observations = {}
-    for seed, (key, box) in enumerate(boxes.items()):
-        # Bounds that are almost infinite cannot be sampled uniformly, and observations are never that large
-        middle = np.clip(0, box.low, box.high)
-        low, high = np.maximum(box.low, middle - 1e3), np.minimum(box.high, middle + 1e3)
-        box = spaces.Box(low.astype(box.dtype), high.astype(box.dtype), dtype=box.dtype.type)
-        box.seed(seed)
-        observations[key] = np.stack([box.sample() for _ in range(batch_size)])
+    for seed, (key, part) in enumerate(parts.items()):
+        if isinstance(part, spaces.Box):
+            # Bounds that are almost infinite cannot be sampled uniformly, and observations are never that large
+            middle = np.clip(0, part.low, part.high)
+            low, high = np.maximum(part.low, middle - 1e3), np.minimum(part.high, middle + 1e3)
+            part = spaces.Box(low.astype(part.dtype), high.astype(part.dtype), dtype=part.dtype.type)
+        part = copy.deepcopy(part)
+        part.seed(seed)
+        observations[key] = np.stack([part.sample() for _ in range(batch_size)])
     return observations
 
 
