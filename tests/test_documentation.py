@@ -35,7 +35,7 @@ from sb3_have.configuration import env_wrapper
 from sb3_have.sensors import EVENT_DTYPE
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PAGES = [ROOT / f"{name}.md" for name in ("README", "CONTRIBUTING", "SECURITY")] + sorted((ROOT / "docs").rglob("*.md"))
 REASONS = ("needs a CARLA server", "needs an account of W&B", "needs a PostgreSQL server")
 STEPS, LEARNING_STARTS, BATCH_SIZE = 60, 50, 8
 """Most steps of a ``learn``, of these before the first update, and samples of an update's batch."""
