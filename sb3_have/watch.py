@@ -33,11 +33,13 @@ from sb3_have.configuration import env_wrapper, hyperparameter, load_config
 from sb3_have.envs.vision import MODALITIES
 from sb3_have.evaluation.recording import Recording, record_episode
 from sb3_have.evaluation.wrapping import saved_normalizer
-from sb3_have.plotting import write_animation
+from sb3_have.plotting import write_animation, write_page
 
 ENV_ID = "HighwayVision-v0"
 # Environments with the keywords `modalities` and `image_size`
 CAMERAS = (ENV_ID, "CarlaVision-v0")
+# Names of their actions
+ACTIONS = ("throttle (negative brakes)", "steering (positive turns right)")
 
 
 def model_file(path: Path) -> Path:
@@ -158,7 +160,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument(
         "model", type=Path, metavar="MODEL", help="zip of a model, checkpoint, or folder of a training run"
     )
-    parser.add_argument("--out", type=Path, default=Path("drive.mp4"), help=".mp4 or .gif; default: %(default)s")
+    parser.add_argument("--out", type=Path, default=Path("drive.mp4"), help=".mp4, .gif or .html; default: %(default)s")
     parser.add_argument("--env", help=f"environment id; default: that of the run, or {ENV_ID}")
     parser.add_argument(
         "--env-kwargs",
@@ -185,8 +187,8 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--stochastic", action="store_true", help="sample the actions")
     parser.add_argument("--device", default="auto")
     args = parser.parse_args(arguments)
-    if args.out.suffix.lower() not in (".mp4", ".gif"):
-        parser.error(f"--out {args.out}: expected a name that ends in .mp4 or .gif")
+    if args.out.suffix.lower() not in (".mp4", ".gif", ".html"):
+        parser.error(f"--out {args.out}: expected a name that ends in .mp4, .gif or .html")
     try:
         recording = watch(args)
     except KeyboardInterrupt:
@@ -225,7 +227,10 @@ def watch(args: argparse.Namespace) -> Recording:
         progress_bar=True,
         normalizer=normalizer,
     )
-    write_animation(recording, args.out, args.fps, args.width, progress_bar=True)
+    if args.out.suffix.lower() == ".html":
+        write_page(recording, args.out, ACTIONS if env_id in CAMERAS else ())
+    else:
+        write_animation(recording, args.out, args.fps, args.width, progress_bar=True)
     return recording
 
 

@@ -228,7 +228,7 @@ def test_what_cannot_be_watched(run: Path, tmp_path: Path, capsys: pytest.Captur
     (tmp_path / "text.zip").write_text("no model")
     assert "nothing is neither a model nor a folder" in refused([str(tmp_path / "nothing"), *out], capsys)
     assert "not a model that SB3 saved" in refused([str(tmp_path / "text.zip"), *out], capsys)
-    assert "ends in .mp4 or .gif" in refused([str(run), "--out", "film.avi"], capsys)
+    assert "ends in .mp4, .gif or .html" in refused([str(run), "--out", "film.avi"], capsys)
     assert "max_steps=0" in refused([str(run), *out, "--steps", "0"], capsys)
     assert "image_size" in refused([str(run), *out, "--env-kwargs", "image_size:40"], capsys)
     assert "NoSuch" in refused([str(run), *out, "--env", "NoSuch-v0"], capsys)

@@ -14,6 +14,7 @@ from sb3_have.plotting.learning import (
     plot_learning_curve,
     plot_learning_curves,
 )
+from sb3_have.plotting.page import write_page
 from sb3_have.plotting.refusion import Response, plot_refusion, refusion_response
 from sb3_have.plotting.style import modality_colours, modality_styles
 from sb3_have.plotting.weather import plot_weather_weights, weather_weights, weights_table
@@ -37,4 +38,5 @@ __all__ = [
     "weights_table",
     "write_animation",
     "write_gif",
+    "write_page",
 ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 
 from sb3_have.envs.vision import compose
 from sb3_have.evaluation.recording import Recording
-from sb3_have.plotting.style import MEDIUM, SMALL, modality_styles, position
+from sb3_have.plotting.style import MEDIUM, SMALL, Style, modality_styles, position
 
 THUMBNAILS = 8
 
@@ -66,7 +66,8 @@ def plot_decomposition(recording: Recording, gamma: float | None = None) -> Figu
     ratios = [3.0, 1.3, 1.0] if recording.weights else [3.0, 1.0]
     figure = Figure(figsize=(8.0, 2.0 + 1.6 * len(ratios)), layout="constrained")
     axes = figure.subplots(len(ratios), 1, sharex=True, height_ratios=ratios)
-    _draw_values(axes[0], recording)
+    for label, style, width, values in value_curves(recording):
+        axes[0].plot(recording.times, values, style.line, color=style.colour, linewidth=width, label=label)
     if gamma is not None:
         returns = _discounted(recording.rewards, gamma)
         axes[0].plot(recording.times, returns, color="0.6", linewidth=3, alpha=0.6, zorder=1, label="discounted return")
@@ -84,14 +85,18 @@ def plot_decomposition(recording: Recording, gamma: float | None = None) -> Figu
     return figure
 
 
-def _draw_values(axis: Axes, recording: Recording) -> None:
+def value_curves(recording: Recording) -> Iterator[tuple[str, Style, float, np.ndarray]]:
+    """
+    Yield the curves of :func:`plot_decomposition`: label, style, width of the line [pt] and values (T,).
+
+    :param recording: Episode of a model whose critic has ``decompose``
+    """
     values, step = recording.values, np.arange(len(recording.infos))
     twins = values["q"].argmin(axis=0)
     if "q_local" in values:
         order = list(recording.weights)
         for name, style in modality_styles(order).items():
-            local = values["q_local"][twins, order.index(name), step]
-            axis.plot(recording.times, local, style.line, color=style.colour, linewidth=1.2, label=f"local: {name}")
+            yield f"local: {name}", style, 1.2, values["q_local"][twins, order.index(name), step]
     # Without re-fusion, the global or the weighted local value is H itself
     mixed = "q_global" in values and "q_lve" in values
     for key, label, line in (
@@ -100,8 +105,7 @@ def _draw_values(axis: Axes, recording: Recording) -> None:
         ("q", "H, re-fusion of both", "-"),
     ):
         if key in values and (mixed or key != "q"):
-            width = 2.2 if key == "q" or not mixed else 1.5
-            axis.plot(recording.times, values[key][twins, step], line, color="#000000", linewidth=width, label=label)
+            yield label, Style("#000000", line), 2.2 if key == "q" or not mixed else 1.5, values[key][twins, step]
 
 
 def _discounted(rewards: np.ndarray, gamma: float) -> np.ndarray:
