@@ -273,7 +273,7 @@ def test_every_page_and_picture_is_used() -> None:
 
 
 def test_site_builds_without_warnings(tmp_path: Path) -> None:
-    for package in ("sphinx", "myst_parser", "furo"):
+    for package in ("sphinx", "myst_parser", "furo", "sphinx-mathjax-offline"):
         pytest.importorskip(package, reason='pip install "sb3_have[docs]"')
     command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "-b", "html", "docs", str(tmp_path / "html")]
     build = subprocess.run(
@@ -286,6 +286,9 @@ def test_site_builds_without_warnings(tmp_path: Path) -> None:
     for module in (sb3_have, sb3_have.have, sb3_have.envs, sb3_have.export, sb3_have.plotting, sb3_have.sensors):
         assert set(module.__all__) - {"__version__", "Representation"} <= named, module.__name__
     assert not re.search("[“”]", (tmp_path / "html" / "api" / "have.html").read_text())  # they could not be pasted
+    for page in (tmp_path / "html").rglob("*.html"):  # formulas need no network either
+        remote = re.findall(r'<(?:script|link|img)[^>]* (?:src|href)="https?:[^"]*"', page.read_text())
+        assert not remote, f"{page.name} loads {remote}"
 
 
 def documented_names(inventory: Path) -> set[str]:
