@@ -2,6 +2,8 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
+# Stamps of the package with what it needs to run, and of the development tools on top
+RUNNABLE = $(VENV)/.runnable
 INSTALLED = $(VENV)/.installed
 SOURCES = sb3_have tests benchmarks notebooks
 # One torch thread a process: the two test processes would otherwise fight over the cores.
@@ -9,7 +11,7 @@ PYTEST = OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2
 
 .PHONY: demo study-quick test docs lint format type commit-checks install clean
 
-demo: $(INSTALLED)
+demo: $(RUNNABLE)
 	$(BIN)/python -m sb3_have.demo
 
 # Does the algorithm still estimate values as it should? A few minutes; fails if a formula is broken.
@@ -37,10 +39,14 @@ commit-checks: format type lint
 
 install: $(INSTALLED)
 
-# The stamp is written last, so an interrupted installation is taken up again.
-$(INSTALLED): setup.cfg pyproject.toml constraints.txt
+# A stamp is written last, so an interrupted installation is taken up again.
+$(RUNNABLE): setup.cfg pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10) and "Python >= 3.10 is needed, found " + sys.version.split()[0] + " (make PYTHON=python3.11 ...)")'
 	test -x $(BIN)/pip || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install -c constraints.txt -e .
+	@touch $@
+
+$(INSTALLED): $(RUNNABLE)
 	$(BIN)/python -m pip install -c constraints.txt -e ".[dev]"
 	@touch $@
 

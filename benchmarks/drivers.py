@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-import gymnasium as gym
 import pandas as pd
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
@@ -24,19 +23,6 @@ from sb3_have.checkpoint.files import write_atomically
 from sb3_have.configuration import evaluation_env_kwargs
 from sb3_have.envs.drivers import KeepStraightDriver, RandomDriver
 from sb3_have.evaluation import Predictor, evaluate
-
-# HighwayVision-v0 that ignores actions and drives itself; with the module, worker processes can register it too
-IDM_ID = "benchmarks.drivers:RuleDriven-v0"
-
-if "RuleDriven-v0" not in gym.registry:
-    of_agents = gym.spec("HighwayVision-v0")
-    gym.register(
-        "RuleDriven-v0",
-        "benchmarks.rule_driven:RuleDrivenEnv",
-        max_episode_steps=of_agents.max_episode_steps,
-        kwargs=of_agents.kwargs,
-        additional_wrappers=of_agents.additional_wrappers,
-    )
 
 
 def drive(grid: Grid, processes: int = 1) -> pd.DataFrame:
@@ -53,7 +39,7 @@ def drive(grid: Grid, processes: int = 1) -> pd.DataFrame:
     drivers: dict[str, tuple[Predictor, str]] = {
         "random": (RandomDriver(0), grid.env),
         "straight at 20 m/s": (KeepStraightDriver(20.0), grid.env),
-        "IDM/MOBIL": (RandomDriver(0), IDM_ID),  # the environment ignores its actions
+        "IDM/MOBIL": (RandomDriver(0), "RuleDriven-v0"),  # the environment ignores its actions
     }
     parts = []
     for name, (driver, env_id) in drivers.items():

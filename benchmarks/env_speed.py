@@ -35,9 +35,9 @@ import torch as th
 
 from benchmarks.measure import RESULTS, Row, interleave, machine, median_ratio, quartiles, save, show
 from benchmarks.road_identity import BlindEnv, StockEnv
-from benchmarks.rule_driven import RuleDrivenEnv
 from sb3_have.envs import HighwayVisionEnv
 from sb3_have.envs.road_shape import SCENARIOS
+from sb3_have.envs.rule_driven import RuleDrivenEnv
 from sb3_have.envs.weather import WEATHERS
 
 SPEED = 15.0

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from benchmarks.rule_driven import RuleDrivenEnv
 from sb3_have.envs import HighwayVisionEnv
+from sb3_have.envs.rule_driven import RuleDrivenEnv
 
 
 class Shot(NamedTuple):

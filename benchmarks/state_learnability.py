@@ -24,10 +24,10 @@ from gymnasium import spaces
 from highway_env.envs.common.observation import ObservationType
 from stable_baselines3 import SAC
 
-from benchmarks.rule_driven import RuleDrivenEnv
 from sb3_have.envs.highway_vision import HighwayVisionEnv
 from sb3_have.envs.road import LANE_WIDTH
 from sb3_have.envs.road_shape import SCENARIOS
+from sb3_have.envs.rule_driven import RuleDrivenEnv
 
 RESULTS = Path(__file__).parent / "results" / "state_learnability.csv"
 COLUMNS = ["setting", "seed", "step", "episodes", "distance_mean", "distance_std", "distance_max"]

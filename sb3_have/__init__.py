@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from sb3_have.evaluation import Recording, evaluate, record_episode
     from sb3_have.export import export_onnx, export_safetensors, load_policy
     from sb3_have.have import HAVESAC, DeepMDPCallback, ModalityWeightsCallback, MultiModalCritic, MultiModalPolicy
+    from sb3_have.trained import pretrained
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
 
@@ -35,6 +36,7 @@ __all__ = [
     "export_safetensors",
     "load_checkpoint",
     "load_policy",
+    "pretrained",
     "record_episode",
     "save_checkpoint",
 ]
@@ -53,10 +55,11 @@ _MODULES = {
     "export_safetensors": "export",
     "load_checkpoint": "checkpoint",
     "load_policy": "export",
+    "pretrained": "trained",
     "record_episode": "evaluation",
     "save_checkpoint": "checkpoint",
 }
-_PACKAGES = ("checkpoint", "common", "evaluation", "export", "have", "plotting", "sensors")
+_PACKAGES = ("checkpoint", "common", "evaluation", "export", "have", "plotting", "sensors", "trained")
 
 
 def __getattr__(name: str) -> Any:

@@ -1,9 +1,10 @@
 """
-Train HAVESAC on HighwayVision-v0 for a few minutes, compare it with rule-based drivers, and film an episode.
+Show a trained driver, train another one for a few minutes, and compare them with drivers that do not learn.
 
     python -m sb3_have.demo [--steps N] [--seed S] [--out runs/demo]
 
-Hyperparameters are those of ``zoo_configs/have-50k.yml``. Use :mod:`sb3_have.train` for longer runs.
+The road is winding ("curves"), so that a driver has to look: straight ahead it ends after about 110 m. Images are
+smaller and the training is shorter than in ``zoo_configs/have.yml``; use :mod:`sb3_have.train` for the whole of it.
 """
 
 from __future__ import annotations
@@ -17,8 +18,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pandas as pd
 import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
@@ -28,17 +31,22 @@ from sb3_have.envs.drivers import KeepStraightDriver, RandomDriver
 from sb3_have.envs.weather import WEATHERS
 from sb3_have.evaluation.episodes import Predictor
 from sb3_have.evaluation.evaluation import evaluate, format_table
-from sb3_have.evaluation.recording import record_episode
-from sb3_have.plotting import plot_learning_curve, plot_modality_weights, write_gif
+from sb3_have.evaluation.recording import Recording, record_episode
+from sb3_have.plotting import plot_learning_curve, plot_modality_weights, write_gif, write_page
 from sb3_have.train import Run
+from sb3_have.trained import pretrained
 
-ENV_ID = "HighwayVision-v0"
-STEPS = 10_000
-# Limit of the training, so that the demo takes at most a quarter of an hour on two cores; the evaluation takes 2.4
-MINUTES = 11.5
-EPISODES = 2
+ENV_ID, RULES_ID = "HighwayVision-v0", "RuleDriven-v0"
+STEPS, IMAGE_SIZE = 12_000, 36
+# Limit of the training, so that the demo takes at most ten minutes
+MINUTES = 7.5
+EPISODES = 1
 PROCESSES = 2
 SHOWN = "HardRainNight"
+# 20 seconds
+SHOWN_STEPS = 100
+ACTIONS = ("throttle", "steering")
+NAME = "this HAVESAC"
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -64,7 +72,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -> dict[str, pd.DataFrame]:
     """
-    Train, evaluate and draw.
+    Show the trained driver, train, evaluate and draw.
 
     :param steps: Number of training steps
     :param time_limit: Limit of the training [s]
@@ -74,10 +82,20 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
     :return: Evaluation of each driver
     """
     started = time.monotonic()
-    config = load_config("have-50k", ENV_ID)
+    out.mkdir(parents=True, exist_ok=True)
+    trained = pretrained("have")
+    with phase(f"Recording {SHOWN_STEPS / 5:g} seconds of a trained driver"):
+        recording = record_episode(trained, ENV_ID, SHOWN, env_kwargs=trained.env_kwargs, max_steps=SHOWN_STEPS)
+        show(recording, out / "trained")
+
+    # The learning rate decays to 0 over the training
+    config = load_config("have", ENV_ID)
+    config["learning_rate"] = f"lin_{config['learning_rate']}"
+    config["env_kwargs"] = {**config["env_kwargs"], "image_size": IMAGE_SIZE}
+    config["callback"] = {"sb3_have.demo.DistanceLine": {"steps": steps}}
     run = Run(config, ENV_ID, out, seed=seed, eval_freq=0, save_freq=0, time_limit=time_limit)
     with phase(f"Training for {steps} steps or {time_limit / 60:g} minutes (Ctrl-C to stop earlier)"):
-        model = run.train(steps, progress_bar=True, keep_checkpoint=False)
+        model = run.train(steps, keep_checkpoint=False)
         if not (out / "model.zip").exists():  # interrupted twice, or before the first step
             raise KeyboardInterrupt
         (out / "model.zip").replace(out / "havesac_demo.zip")
@@ -87,51 +105,98 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
     # Leave the cores to the processes of the environments
     th.set_num_threads(1)
     env_kwargs = evaluation_env_kwargs(config)
-    drivers: dict[str, Predictor] = {
-        "HAVESAC": model,
-        "random": RandomDriver(seed),
-        "straight at 25 m/s": KeepStraightDriver(25.0),
-        "straight at 20 m/s": KeepStraightDriver(20.0),
+    drivers: dict[str, tuple[Predictor, str, dict[str, Any]]] = {
+        NAME: (model, ENV_ID, env_kwargs),
+        "trained HAVESAC": (trained, ENV_ID, trained.env_kwargs),
+        "random": (RandomDriver(seed), ENV_ID, env_kwargs),
+        "straight at 20 m/s": (KeepStraightDriver(20.0), ENV_ID, env_kwargs),
+        "IDM/MOBIL": (RandomDriver(seed), RULES_ID, env_kwargs),  # the environment ignores the actions
     }
+    results = {}
     with phase(f"Evaluating {len(drivers)} drivers, {n_episodes} episodes in each of {len(WEATHERS)} weathers"):
-        results = {
-            name: evaluate(
+        for name, (driver, env_id, kwargs) in drivers.items():
+            results[name] = evaluate(
                 driver,
-                ENV_ID,
+                env_id,
                 WEATHERS,
                 n_episodes,
-                env_kwargs=env_kwargs,
+                env_kwargs=kwargs,
                 n_envs=PROCESSES,
                 progress_bar=True,
                 vec_env_cls=SubprocVecEnv,
             )
-            for name, driver in drivers.items()
-        }
-        table = pd.concat(results, names=["driver"]).reset_index(level="driver").reset_index(drop=True)
-        table.to_csv(out / "evaluation.csv", index=False)
+            table = pd.concat(results, names=["driver"]).reset_index(level="driver").reset_index(drop=True)
+            table.to_csv(out / "evaluation.csv", index=False)
         print(format_table(results))
+        print("IDM/MOBIL is told where the traffic is; the other drivers have to look, or do not.")
 
     with phase("Drawing"):
-        draw(model, results, env_kwargs, out)
+        others = {name: float(rows["distance_mean"].mean()) for name, rows in results.items() if name != NAME}
+        curve = plot_learning_curve(load_results(str(out)), references=others)
+        curve.savefig(out / "learning_curve.png", dpi=120)
+        recording = record_episode(model, ENV_ID, SHOWN, env_kwargs=env_kwargs)
+        plot_modality_weights(recording).savefig(out / "modality_weights.png", dpi=120)
+        show(recording, out / "drive")
     print(f"Everything is in {out} after {(time.monotonic() - started) / 60:.1f} minutes.")
     return results
 
 
-def draw(model: Any, results: dict[str, pd.DataFrame], env_kwargs: dict[str, Any], out: Path) -> None:
+def show(recording: Recording, path: Path) -> None:
     """
-    Write the figures and the film.
+    Write an episode as a GIF and as a page for a browser.
 
-    :param model: The trained model
-    :param results: Evaluation of each driver
-    :param env_kwargs: Keyword arguments of the environment
-    :param out: Folder for the results, with the ``monitor.csv`` of the training
+    :param recording: The episode
+    :param path: Path of both files without their endings
     """
-    others = {name: float(frame["distance_mean"].mean()) for name, frame in results.items() if name != "HAVESAC"}
-    curve = plot_learning_curve(load_results(str(out)), references=others)
-    curve.savefig(out / "learning_curve.png", dpi=120)
-    recording = record_episode(model, ENV_ID, SHOWN, env_kwargs=env_kwargs)
-    plot_modality_weights(recording).savefig(out / "modality_weights.png", dpi=120)
-    write_gif(recording, out / "drive.gif")
+    write_gif(recording, path.with_suffix(".gif"))
+    write_page(recording, path.with_suffix(".html"), ACTIONS)
+    print(f"{recording.end['distance']:.0f} m: see {path}.gif, or open {path}.html in a browser")
+
+
+class DistanceLine(BaseCallback):
+    """
+    Callback that shows the distance of the training episodes over the steps, as a line of small bars.
+
+    The highest bar stands for the largest distance so far. In a terminal, the line is drawn anew at the end of each
+    episode; elsewhere it is printed ten times in the training.
+
+    :param steps: Number of training steps
+    """
+
+    BARS = " ▁▂▃▄▅▆▇█"
+    WIDTH = 40
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self.steps = steps
+        self.episodes: list[tuple[int, float]] = []
+
+    def _on_step(self) -> bool:
+        ends = [info["distance"] for info in self.locals["infos"] if "episode" in info]
+        self.episodes += [(self.num_timesteps, distance) for distance in ends]
+        if sys.stdout.isatty():
+            if ends:
+                print(f"\r{self.line()}", end="", flush=True)
+        elif self.num_timesteps % max(1, self.steps // 10) == 0:
+            print(self.line(), flush=True)
+        return True
+
+    def _on_training_end(self) -> None:
+        if sys.stdout.isatty():
+            print()
+
+    def line(self) -> str:
+        """Return the line: steps, bars, and the mean distance of the last ten episodes."""
+        sums, counts = np.zeros(self.WIDTH), np.zeros(self.WIDTH)
+        for step, distance in self.episodes:
+            column = min(self.WIDTH - 1, self.WIDTH * step // self.steps)
+            sums[column] += distance
+            counts[column] += 1
+        means = sums / np.maximum(1, counts)
+        levels = np.ceil(means / max(1.0, means.max()) * (len(self.BARS) - 1)).astype(int)
+        last = [distance for _, distance in self.episodes[-10:]]
+        mean = f"{np.mean(last):5.0f} m in the last {len(last)} episodes" if last else ""
+        return f"step {self.num_timesteps:6d} |{''.join(self.BARS[level] for level in levels)}| {mean}"
 
 
 @contextmanager

@@ -3,11 +3,12 @@ Film a trained model: an episode with the sensors' images, the modality weights,
 
     python -m sb3_have.watch runs/have-0 --weather HardRainNight --out drive.mp4
 
-MODEL is a zip that SB3 saved, a checkpoint, or the folder of a run of ``python -m sb3_have.train``. The settings of a
-run include its environment. Without them it is HighwayVision-v0 as in ``--config``, with the modalities and the image
-size that the model was trained with, unless ``--env`` and ``--env-kwargs`` name another one. The statistics of
-``VecNormalize`` are read from the checkpoint, or from ``vecnormalize.pkl`` beside the model or where the Zoo saves it;
-the zip of a model does not show whether it needs them.
+MODEL is a zip that SB3 saved, a checkpoint, the folder of a run of ``python -m sb3_have.train``, or the name of a
+trained driver that comes with the package: ``have`` or ``have-depth``. The settings of a run include its environment.
+Without them it is HighwayVision-v0 as in ``--config``, with the modalities and the image size that the model was trained
+with, unless ``--env`` and ``--env-kwargs`` name another one. The statistics of ``VecNormalize`` are read from the
+checkpoint, or from ``vecnormalize.pkl`` beside the model or where the Zoo saves it; the zip of a model does not show
+whether it needs them.
 """
 
 from __future__ import annotations
@@ -31,9 +32,11 @@ from sb3_have.checkpoint.archive import DamagedCheckpointError
 from sb3_have.checkpoint.checkpoint import checkpoint_info, checkpoints
 from sb3_have.configuration import env_wrapper, hyperparameter, load_config
 from sb3_have.envs.vision import MODALITIES
+from sb3_have.evaluation.episodes import Predictor
 from sb3_have.evaluation.recording import Recording, record_episode
 from sb3_have.evaluation.wrapping import saved_normalizer
 from sb3_have.plotting import write_animation, write_page
+from sb3_have.trained import DRIVERS, pretrained
 
 ENV_ID = "HighwayVision-v0"
 # Environments with the keywords `modalities` and `image_size`
@@ -158,7 +161,10 @@ def main(arguments: list[str] | None = None) -> None:
         prog="python -m sb3_have.watch", description=(__doc__ or "").strip().splitlines()[0]
     )
     parser.add_argument(
-        "model", type=Path, metavar="MODEL", help="zip of a model, checkpoint, or folder of a training run"
+        "model",
+        type=Path,
+        metavar="MODEL",
+        help=f"zip of a model, checkpoint, folder of a training run, or a trained driver: {', '.join(DRIVERS)}",
     )
     parser.add_argument("--out", type=Path, default=Path("drive.mp4"), help=".mp4, .gif or .html; default: %(default)s")
     parser.add_argument("--env", help=f"environment id; default: that of the run, or {ENV_ID}")
@@ -208,11 +214,18 @@ def watch(args: argparse.Namespace) -> Recording:
     :param args: Arguments of :func:`main`
     """
     args.out.parent.mkdir(parents=True, exist_ok=True)
-    file = model_file(args.model)
-    model, settings = load_model(file, args.algo, args.device)
-    env_id, env_kwargs, config = environment(model, settings, args.env, args.config)
+    model: Predictor
+    config: Mapping[str, Any] = {}
+    statistics = args.vecnormalize
+    if str(args.model) in DRIVERS and not args.model.exists():
+        model = pretrained(str(args.model), args.device)
+        env_id, env_kwargs = args.env or model.card["env_id"], model.env_kwargs
+    else:
+        file = model_file(args.model)
+        model, settings = load_model(file, args.algo, args.device)
+        env_id, env_kwargs, config = environment(model, settings, args.env, args.config)
+        statistics = statistics or statistics_file(file, env_id)
     env_kwargs |= dict(args.env_kwargs) | ({} if args.weather is None else {"weather": args.weather})
-    statistics = args.vecnormalize or statistics_file(file, env_id)
     normalizer = None if statistics is None else saved_normalizer(statistics)
     print(f"{env_id} {env_kwargs}" + ("" if normalizer is None else f", observations normalized as in {statistics}"))
     recording = record_episode(

@@ -3,22 +3,28 @@
 import errno
 import os
 import re
+import shutil
 import sys
 import tracemalloc
 import warnings
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
+from envs import TINY, RandomSensors, image
+from gymnasium import spaces
 from resuming import Drifting, assert_same, everything, leaves
 from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import DictReplayBuffer
 from stable_baselines3.common.callbacks import EveryNTimesteps
 from stable_baselines3.common.monitor import Monitor
-from stable_baselines3.common.vec_env import DummyVecEnv
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
 
+from sb3_have import HAVESAC
 from sb3_have.checkpoint import (
     DamagedCheckpointError,
     ResumableCheckpointCallback,
@@ -151,6 +157,22 @@ def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str) 
     assert names(tmp_path) == ["checkpoint-10"]
     resumed = load_checkpoint(tmp_path, make_env(), device="cpu").learn(20, reset_num_timesteps=False)
     assert_same(everything(resumed), expected)
+
+
+def test_a_disk_that_is_too_small_is_noticed_at_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """HAVESAC stores 36x36x3 bytes per step, however many frames are stacked; SB3's buffers store all of them twice."""
+    env = VecFrameStack(DummyVecEnv([lambda: RandomSensors(spaces.Dict({"rgb": image(3)}))]), 3)
+    kwargs: dict[str, Any] = {"env": env, "policy_kwargs": TINY, "learning_starts": 100, "device": "cpu"}
+    stored_once = HAVESAC("MultiInputPolicy", buffer_size=20, **kwargs)
+    stored_twice = HAVESAC("MultiInputPolicy", buffer_size=20, replay_buffer_class=DictReplayBuffer, **kwargs)
+    frames = 3 * 36 * 36 * 3  # in three checkpoints: two that are kept, and one that is being written
+    cases = [(stored_once, 30, 20 * frames), (stored_once, 9, 9 * frames), (stored_twice, 9, 2 * 3 * 9 * frames)]
+    for model, steps, needed in cases:
+        monkeypatch.setattr(shutil, "disk_usage", lambda _, free=needed: SimpleNamespace(free=free))
+        model.learn(steps, ResumableCheckpointCallback(tmp_path / f"{needed}", 1000))
+        monkeypatch.setattr(shutil, "disk_usage", lambda _, free=needed - 1: SimpleNamespace(free=free))
+        with pytest.warns(UserWarning, match=r"3 checkpoints in .* may need 0\.0 GB, and the disk has 0\.0 GB left"):
+            model.learn(steps, ResumableCheckpointCallback(tmp_path / f"{needed} less", 1000))
 
 
 def test_unfinished_file_that_cannot_be_removed(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """The demo from end to end, in a small stand-in for the highway."""
 
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pandas as pd
 import pytest
@@ -9,26 +9,70 @@ from fake_drive import CONFIG, ENV_ID, FakeDrive
 from PIL import Image
 
 from sb3_have import HAVESAC, demo
+from sb3_have.envs.drivers import RandomDriver
+
+
+class Coaster(RandomDriver):
+    """Stands for the trained driver of the package."""
+
+    env_kwargs: ClassVar[dict[str, Any]] = {}
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The demo with a small environment and a small model."""
+    config = {**CONFIG, "learning_rate": 1e-3, "policy_kwargs": {"features_dim": 4, "net_arch": [8]}}
+    constants = {"ENV_ID": ENV_ID, "RULES_ID": ENV_ID, "WEATHERS": ("slow", "fast"), "SHOWN": "fast", "PROCESSES": 1}
+    functions = {"load_config": lambda *_: dict(config), "pretrained": lambda _: Coaster()}
+    for name, value in {**constants, **functions}.items():
+        monkeypatch.setattr(demo, name, value)
 
 
 def test_the_demo_writes_all_of_its_results_and_can_be_repeated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(demo, "ENV_ID", ENV_ID)
-    config = {**CONFIG, "policy_kwargs": {"features_dim": 4, "net_arch": [8]}}
-    monkeypatch.setattr(demo, "load_config", lambda *_: config)
-    monkeypatch.setattr(demo, "WEATHERS", ("slow", "fast"))
-    monkeypatch.setattr(demo, "SHOWN", "fast")
     for steps in (20, 30):  # the second run finds the results of the first in its folder
         demo.main(["--steps", str(steps), "--episodes", "1", "--out", str(tmp_path)])
-        assert HAVESAC.load(tmp_path / "havesac_demo.zip").num_timesteps == steps
+        model = HAVESAC.load(tmp_path / "havesac_demo.zip")
+        assert model.num_timesteps == steps and model.lr_schedule(0.25) == pytest.approx(0.25e-3)
     table = pd.read_csv(tmp_path / "evaluation.csv")
-    assert list(table["driver"].unique()) == ["HAVESAC", "random", "straight at 25 m/s", "straight at 20 m/s"]
-    assert list(table["weather"]) == ["slow", "fast"] * 4
-    assert "ER" in capsys.readouterr().out
-    for name in ("learning_curve.png", "modality_weights.png", "drive.gif"):
+    drivers = ["this HAVESAC", "trained HAVESAC", "random", "straight at 20 m/s", "IDM/MOBIL"]
+    assert list(table["driver"].unique()) == drivers
+    assert list(table["weather"]) == ["slow", "fast"] * len(drivers)
+    printed = capsys.readouterr().out
+    assert "ER" in printed and printed.count("m in the last") > 10
+    for name in ("trained.gif", "learning_curve.png", "modality_weights.png", "drive.gif"):
         with Image.open(tmp_path / name) as picture:
             assert picture.width > 100
+    assert (tmp_path / "trained.html").exists() and (tmp_path / "drive.html").exists()
+
+
+def test_the_line_of_distances() -> None:
+    line = demo.DistanceLine(steps=80)
+    assert line.line() == f"step      0 |{' ' * 40}| "
+    line.episodes, line.num_timesteps = [(2, 8.0), (3, 16.0), (40, 80.0), (80, 40.0)], 80
+    assert line.line() == f"step     80 | ▂{' ' * 18}█{' ' * 18}▄|    36 m in the last 4 episodes"
+    line.episodes = [(2, 0.0)] + [(4, 10.0)] * 10
+    assert line.line().endswith("   10 m in the last 10 episodes")
+
+
+def test_an_interruption_keeps_what_is_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    evaluate, evaluated = demo.evaluate, []
+
+    def interrupted(driver: Any, *args: Any, **kwargs: Any) -> pd.DataFrame:
+        evaluated.append(driver)
+        if len(evaluated) == 3:
+            raise KeyboardInterrupt
+        return evaluate(driver, *args, **kwargs)
+
+    monkeypatch.setattr(demo, "evaluate", interrupted)
+    with pytest.raises(SystemExit) as stop:
+        demo.main(["--steps", "20", "--out", str(tmp_path)])
+    assert stop.value.code == 130 and f"the results so far are in {tmp_path}" in capsys.readouterr().err
+    assert list(pd.read_csv(tmp_path / "evaluation.csv")["driver"].unique()) == ["this HAVESAC", "trained HAVESAC"]
+    assert HAVESAC.load(tmp_path / "havesac_demo.zip").num_timesteps == 20
 
 
 def test_the_demo_ends_when_interrupted_before_the_first_step(
@@ -37,9 +81,6 @@ def test_the_demo_ends_when_interrupted_before_the_first_step(
     def interrupted(self: FakeDrive, action: Any) -> Any:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(demo, "ENV_ID", ENV_ID)
-    config = {**CONFIG, "policy_kwargs": {"features_dim": 4, "net_arch": [8]}}
-    monkeypatch.setattr(demo, "load_config", lambda *_: config)
     monkeypatch.setattr(FakeDrive, "step", interrupted)
     with pytest.raises(SystemExit) as stop:
         demo.main(["--steps", "20", "--out", str(tmp_path)])

@@ -22,6 +22,14 @@ from sb3_have.evaluation.recording import Recording, record_episode
 from sb3_have.evaluation.wrapping import saved_normalizer
 
 
+def test_a_policy_is_recorded_as_its_model_is() -> None:
+    model = tiny_model(vectors_space())
+    recordings = [record_episode(driver, RandomSensors(vectors_space(), length=3)) for driver in (model, model.policy)]
+    for name, values in recordings[0].values.items():
+        np.testing.assert_array_equal(recordings[1].values[name], values)
+    assert recordings[0].values and recordings[1].weights.keys() == recordings[0].weights.keys()
+
+
 def of_step(recording: Recording, step: int) -> dict[str, np.ndarray]:
     return {key: value[None] for key, value in recording.observations[step].items()}
 

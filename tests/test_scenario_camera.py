@@ -8,11 +8,11 @@ import pytest
 from highway_env.road.lane import AbstractLane
 from numpy.typing import NDArray
 
-from benchmarks.rule_driven import RuleDrivenEnv
 from sb3_have.envs.camera import Camera
 from sb3_have.envs.lanes import FORWARD, ONCOMING, ShapedNetwork
 from sb3_have.envs.road import ROAD_LENGTH
 from sb3_have.envs.road_shape import PERIOD, RAMP_ENDS, RAMP_JOINS, RAMP_TAPERS, SCENARIOS, SHOULDER_WIDTH, road_shape
+from sb3_have.envs.rule_driven import RuleDrivenEnv
 from sb3_have.envs.scene import DASH_LENGTH, LINE_WIDTH, RAIL_PIECE, RAMP_DASH_PERIOD, STEEL, WORLD_PERIOD
 from sb3_have.envs.vision import VisionSensors
 

@@ -224,6 +224,14 @@ def test_ctrl_c_in_an_evaluation_without_handler(tmp_path: Path, monkeypatch: py
         model.learn(8, callback.WeatherEvalCallback(ENV_ID, ["slow"], tmp_path / "rows.csv", eval_freq=5))
 
 
+def test_a_folder_for_evaluations_is_made(tmp_path: Path) -> None:
+    rows = tmp_path / "new" / "folder" / "rows.csv"
+    model = make_run(tmp_path / "run", eval_freq=0).train(8)
+    model.set_env(make_training_env(ENV_ID, CONFIG))
+    model.learn(8, callback.WeatherEvalCallback(ENV_ID, ["slow"], rows, eval_freq=5, n_eval_episodes=1))
+    assert len(pd.read_csv(rows)) == 1
+
+
 def test_evaluations_of_another_training_are_kept(tmp_path: Path) -> None:
     model = make_run(tmp_path).train(12)
     model.set_env(make_training_env(ENV_ID, CONFIG))

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import os
+import shutil
 import warnings
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from filelock import FileLock
+from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
@@ -17,6 +20,7 @@ from sb3_have.checkpoint.archive import damage
 from sb3_have.checkpoint.checkpoint import checkpoint_step, checkpoints, save_checkpoint
 from sb3_have.checkpoint.files import locked
 from sb3_have.checkpoint.random_state import random_states, set_random_states
+from sb3_have.common.buffers import ModalityReplayBuffer
 
 
 class ResumableCheckpointCallback(BaseCallback):
@@ -25,6 +29,7 @@ class ResumableCheckpointCallback(BaseCallback):
 
     Put it first in the list of callbacks, so that no callback's ``_on_rollout_start`` runs twice after resuming. The
     state of all callbacks is saved. If a checkpoint cannot be written, a warning is issued and training continues.
+    A warning at the start says if the disk looks too small.
 
     There is a checkpoint at the end of training too, unless a callback ended it: its last step is incomplete then.
 
@@ -82,6 +87,7 @@ class ResumableCheckpointCallback(BaseCallback):
         if self._lock is None:
             self._lock = locked(self.folder).lock
         self._refuse_later_checkpoints()
+        self._warn_if_disk_is_small()
         # `learn` begins by resetting the action noise
         if self._noise is not None:
             self.model.action_noise = self._noise["action_noise"]
@@ -95,6 +101,24 @@ class ResumableCheckpointCallback(BaseCallback):
                     "load_checkpoint and `learn(..., reset_num_timesteps=False)`; to start a new training, choose "
                     "another folder, or remove this one."
                 )
+
+    def _warn_if_disk_is_small(self) -> None:
+        """Estimate the size of the checkpoints, most of which is the replay buffer."""
+        model: Any = self.model
+        steps = min(model.buffer_size, self.locals["total_timesteps"])
+        space = model.observation_space
+        parts: list[Any] = [*space.spaces.values()] if isinstance(space, spaces.Dict) else [space]
+        observation = sum(part.dtype.itemsize * int(np.prod(part.shape)) for part in parts)
+        # SB3's buffers store each observation twice, and all of its stacked frames
+        copies = 1 / model.replay_buffer.n_stack if isinstance(model.replay_buffer, ModalityReplayBuffer) else 2
+        needed = (self.keep + 1) * steps * observation * copies
+        free = shutil.disk_usage(self.folder).free
+        if needed > free:
+            warnings.warn(
+                f"{self.keep + 1} checkpoints in {self.folder} may need {needed / 1e9:.1f} GB, and the disk has "
+                f"{free / 1e9:.1f} GB left: make room, choose another folder, or a smaller buffer_size.",
+                stacklevel=2,
+            )
 
     def _on_rollout_start(self) -> None:
         # Save between two rollouts, where nothing is pending: in `_on_step` the transition is not stored yet, and in

@@ -96,6 +96,7 @@ class WeatherEvalCallback(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._started, self._last_step = time.monotonic(), 0
+        self.path.parent.mkdir(parents=True, exist_ok=True)
         if not self.path.exists():
             return
         # Drop the rows after the checkpoint that training resumes from

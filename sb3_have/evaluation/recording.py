@@ -149,8 +149,9 @@ def weighing(model: Any) -> Callable[[Any], Mapping[str, np.ndarray]] | None:
 
 
 def _values(model: Any, observations: Any, actions: np.ndarray) -> dict[str, np.ndarray]:
-    tensors, _ = model.policy.obs_to_tensor(observations)
-    scaled = np.reshape(model.policy.scale_action(actions), (len(actions), -1))
+    policy = getattr(model, "policy", model)
+    tensors, _ = policy.obs_to_tensor(observations)
+    scaled = np.reshape(policy.scale_action(actions), (len(actions), -1))
     with th.no_grad():
         parts = model.critic.decompose(tensors, th.as_tensor(scaled, dtype=th.float32, device=model.device))
     return {name: part.float().cpu().numpy() for name, part in parts.items() if name != "weights"}
