@@ -6,6 +6,11 @@ from typing import Any
 import gymnasium as gym
 import pytest
 from gymnasium.wrappers import TimeLimit
+from hypothesis import HealthCheck, settings
+
+# No test may depend on how busy the machine is
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
 
 TIME_LIMIT_PLACES: list[Any] = [gym.wrappers, gym.wrappers.common, gym.envs.registration]
 

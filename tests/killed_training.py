@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 from sb3_have.checkpoint import ResumableCheckpointCallback, archive, checkpoints, load_checkpoint
 
 STEPS, SAVE_FREQ = 240, 10
-MINUTES = 10
+MINUTES = 120
 
 
 def kill(*args: Any) -> None:

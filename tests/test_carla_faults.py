@@ -512,6 +512,6 @@ raise ValueError("a mistake")
 
 def test_a_program_that_ends_with_an_exception() -> None:
     folder = Path(__file__).parent
-    done = subprocess.run([sys.executable, "-c", PROGRAM], cwd=folder, capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, "-c", PROGRAM], cwd=folder, capture_output=True, text=True)
     assert done.stdout.strip() == "[] True", done.stderr
     assert done.stderr.strip().endswith("ValueError: a mistake")

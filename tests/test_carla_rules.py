@@ -216,4 +216,4 @@ def test_importing_does_not_require_carla() -> None:
         "except ImportError as error: assert \"pip install 'sb3_have[carla]'\" in str(error), error\n"
         "else: raise AssertionError('no error')\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=300)
+    subprocess.run([sys.executable, "-c", code], check=True)

@@ -57,7 +57,7 @@ def test_there_are_six() -> None:
 def test_runs(path: Path, kernel: KernelManager) -> None:
     notebook = nbformat.read(path, as_version=4)  # type: ignore[no-untyped-call]
     notebook.cells.insert(0, nbformat.v4.new_code_cell(STRICT))  # type: ignore[no-untyped-call]
-    client = NotebookClient(notebook, km=kernel, timeout=300)
+    client = NotebookClient(notebook, km=kernel, timeout=None, startup_timeout=1800)
     try:
         client.execute()
     finally:
