@@ -5,7 +5,7 @@ Policies for deployment: safetensors, which are read without unpickling anything
     policy = load_policy("policy")
     export_onnx(model, "policy.onnx")
 
-They need ``pip install "sb3_have[export]"``. Checkpoints to resume a training from are in :mod:`sb3_have.checkpoint`.
+ONNX needs ``pip install "sb3_have[export]"``. Checkpoints to resume a training from are in :mod:`sb3_have.checkpoint`.
 """
 
 from sb3_have.export.onnx import export_onnx
