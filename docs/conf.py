@@ -1,20 +1,34 @@
 """The documentation site: `make docs`, or `python -m sphinx -W --keep-going -b html docs docs/_build/html`."""
 
 import re
+import sys
+from pathlib import Path
 from typing import Any
 
 from sb3_have import __version__
+
+sys.path.insert(0, str(Path(__file__).parent / "_ext"))
 
 project = "sb3_have"
 author = "sb3_have contributors"
 project_copyright = author
 release = version = __version__
 
-# MathJax is part of the site, so that formulas need no network
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.mathjax", "sphinx-mathjax-offline", "sphinx.ext.viewcode"]
+# MathJax is part of the site, so that formulas need no network. "results" is in _ext.
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx-mathjax-offline",
+    "sphinx.ext.viewcode",
+    "results",
+]
 exclude_patterns = ["_build"]
 html_theme = "furo"
 html_title = "sb3_have"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_js_files = ["sort_tables.js"]
 html_copy_source = False
 smartquotes_action = "D"  # dashes alone: what docstrings quote is code to copy
 
