@@ -76,7 +76,7 @@ def config_path(name: str | Path) -> Path:
     for path in (Path(name), _folder() / f"{name}.yml"):
         if path.is_file():
             return path
-    raise FileNotFoundError(f"there is no configuration {str(name)!r}{_suggest(str(name), config_names())}")
+    raise FileNotFoundError(f"there is no configuration {str(name)!r}{suggest(str(name), config_names())}")
 
 
 def config_names() -> list[str]:
@@ -90,7 +90,8 @@ def _folder() -> Path:
     return inside if inside.is_dir() else Path(__file__).parents[1] / "zoo_configs"
 
 
-def _suggest(word: str, known: Iterable[str]) -> str:
+def suggest(word: str, known: Iterable[str]) -> str:
+    """Return the end of an error about an unknown word: the known one that was probably meant, and all of them."""
     near = get_close_matches(word, list(known), n=1, cutoff=0.75)
     available = ", ".join(sorted(known))
     return f"; did you mean {near[0]!r}? Available: {available}" if near else f"; available: {available}"
@@ -147,7 +148,7 @@ def algorithm_of(name: str | Path) -> str:
         return algorithm_of(_base(name, content))
     algo = str(content.get("algo", "havesac"))
     if algo not in ALGORITHMS:
-        raise ValueError(f"{config_path(name)}: there is no algo {algo!r}{_suggest(algo, ALGORITHMS)}")
+        raise ValueError(f"{config_path(name)}: there is no algo {algo!r}{suggest(algo, ALGORITHMS)}")
     return algo
 
 
@@ -171,7 +172,7 @@ def check_keys(config: Mapping[str, Any], algo: str) -> None:
     """
     known = known_keys(algo)
     if unknown := [key for key in config if key not in known]:
-        raise ValueError(f"{algo} has no hyper-parameter {unknown[0]!r}{_suggest(unknown[0], known)}")
+        raise ValueError(f"{algo} has no hyper-parameter {unknown[0]!r}{suggest(unknown[0], known)}")
 
 
 def evaluation_env_kwargs(config: Mapping[str, Any]) -> dict[str, Any]:

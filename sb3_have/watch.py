@@ -5,10 +5,9 @@ Film a trained model: an episode with the sensors' images, the modality weights,
 
 MODEL is a zip that SB3 saved, a checkpoint, the folder of a run of ``python -m sb3_have.train``, or the name of a
 trained driver that comes with the package: ``have`` or ``have-depth``. The settings of a run include its environment.
-Without them it is HighwayVision-v0 as in ``--config``, with the modalities and the image size that the model was trained
-with, unless ``--env`` and ``--env-kwargs`` name another one. The statistics of ``VecNormalize`` are read from the
-checkpoint, or from ``vecnormalize.pkl`` beside the model or where the Zoo saves it; the zip of a model does not show
-whether it needs them.
+Without them it is HighwayVision-v0 as in ``--config``, with the modalities and the image size of the model, unless
+``--env`` and ``--env-kwargs`` name another one. The statistics of ``VecNormalize`` are read from the checkpoint, or from
+``vecnormalize.pkl`` beside the model or where the Zoo saves it; the zip of a model does not show whether it needs them.
 """
 
 from __future__ import annotations

@@ -29,7 +29,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -39,7 +38,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError, field_validator, model_validator
 
 from sb3_have.benchmark.reading import method_name
-from sb3_have.configuration import algorithm_of, config_path, known_keys, load_config
+from sb3_have.configuration import algorithm_of, config_path, known_keys, load_config, suggest
 from sb3_have.envs.weather import WEATHERS
 from sb3_have.sensors import SENSORS, failures_for
 
@@ -284,7 +283,7 @@ def _in_words(error: Any) -> str:
     key, kind = ".".join(map(str, error["loc"])), error["type"]
     if kind == "extra_forbidden":
         fields = Failures.model_fields if len(error["loc"]) > 1 else Grid.model_fields
-        return f"unknown key {key!r}{_suggestion(str(error['loc'][-1]), fields)}"
+        return f"unknown key {key!r}{suggest(str(error['loc'][-1]), fields)}"
     if kind == "missing":
         return f"the key {key!r} is missing"
     message = error["msg"].removeprefix("Value error, ")
@@ -295,15 +294,8 @@ def _known(names: Iterable[str], known: Iterable[str], prefix: str = "") -> tupl
     """Return the names, or raise an error if one is unknown."""
     names, known = tuple(names), set(known)
     if unknown := [name for name in names if name not in known]:
-        raise ValueError(f"{prefix}unknown name {unknown[0]!r}{_suggestion(unknown[0], known)}")
+        raise ValueError(f"{prefix}unknown name {unknown[0]!r}{suggest(unknown[0], known)}")
     return names
-
-
-def _suggestion(word: str, known: Iterable[str]) -> str:
-    """Suggest the word that was probably meant, or all of them if none is similar."""
-    known = sorted(known)
-    similar = get_close_matches(word, known, n=1)
-    return f"; did you mean {similar[0]!r}?" if similar else f"; choose from {', '.join(known)}"
 
 
 def _refuse_numbers_as_text(values: Mapping[str, Any]) -> None:
