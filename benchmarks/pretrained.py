@@ -4,14 +4,15 @@ Make the trained drivers of the package, and check the distances that their JSON
     python -m benchmarks.pretrained make RUN NAME --commit COMMIT --command "python -m sb3_have.train ..."
     python -m benchmarks.pretrained check NAME
 
-RUN is the folder of a run of ``sb3_have.train`` or of the benchmark. ``check`` drives the same episodes again, and fails
-if their mean distance is outside of the interval in the JSON file.
+RUN is the folder of a run of ``sb3_have.train`` or of the benchmark. ``check`` drives the same episodes again, and
+fails if their mean distance is outside of the interval in the JSON file.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -20,18 +21,18 @@ import pandas as pd
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
 from sb3_have import MultiModalPolicy
-from sb3_have.benchmark.provenance import machine
+from sb3_have.benchmark.provenance import PACKAGES, cpu_model
 from sb3_have.configuration import evaluation_env_kwargs
 from sb3_have.envs.weather import WEATHERS
 from sb3_have.evaluation.evaluation import evaluate_episodes
 from sb3_have.evaluation.statistics import mean, stratified_bootstrap
 from sb3_have.trained import PretrainedPolicy, pretrained, save_driver
-from sb3_have.watch import load_model, model_file
+from sb3_have.watch import environment, load_model, model_file
 
 ENV_ID = "HighwayVision-v0"
 # Episodes that no training has evaluated in
 SEED = 4_000_000
-EPISODES = 10
+EPISODES = 5
 
 
 def drive(name: str, policy: PretrainedPolicy, processes: int) -> pd.DataFrame:
@@ -67,15 +68,17 @@ def make(run: Path, name: str, commit: str, command: str, processes: int) -> Non
     """Write the files of a driver, drive it, and add its distances."""
     model, settings = load_model(model_file(run))
     assert isinstance(model.policy, MultiModalPolicy)
+    _, env_kwargs, _ = environment(model, settings, ENV_ID, "have")
     card: dict[str, Any] = {
         "env_id": ENV_ID,
-        "env_kwargs": evaluation_env_kwargs(settings["config"]),
+        "env_kwargs": evaluation_env_kwargs({"env_kwargs": env_kwargs}),
         "training": {
             "commit": commit,
             "command": command,
             "steps": model.num_timesteps,
-            "seed": settings["seed"],
-            **machine(),
+            "seed": model.seed,
+            "machine": cpu_model(),
+            "versions": {package: version(package) for package in PACKAGES},
         },
     }
     save_driver(model.policy, name, card)

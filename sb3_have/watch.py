@@ -6,8 +6,8 @@ Film a trained model: an episode with the sensors' images, the modality weights,
 MODEL is a zip that SB3 saved, a checkpoint, the folder of a run of ``python -m sb3_have.train``, or the name of a
 trained driver that comes with the package: ``have`` or ``have-depth``. The settings of a run include its environment.
 Without them it is HighwayVision-v0 as in ``--config``, with the modalities and the image size of the model, unless
-``--env`` and ``--env-kwargs`` name another one. The statistics of ``VecNormalize`` are read from the checkpoint, or from
-``vecnormalize.pkl`` beside the model or where the Zoo saves it; the zip of a model does not show whether it needs them.
+``--env`` and ``--env-kwargs`` name another one. The statistics of ``VecNormalize`` are read from the checkpoint, or
+from ``vecnormalize.pkl`` beside the model or where the Zoo saves it; the zip does not show whether they are needed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from sb3_have.evaluation.episodes import Predictor
 from sb3_have.evaluation.recording import Recording, record_episode
 from sb3_have.evaluation.wrapping import saved_normalizer
 from sb3_have.plotting import write_animation, write_page
-from sb3_have.trained import DRIVERS, pretrained
+from sb3_have.trained import driver_names, pretrained
 
 ENV_ID = "HighwayVision-v0"
 # Environments with the keywords `modalities` and `image_size`
@@ -163,7 +163,7 @@ def main(arguments: list[str] | None = None) -> None:
         "model",
         type=Path,
         metavar="MODEL",
-        help=f"zip of a model, checkpoint, folder of a training run, or a trained driver: {', '.join(DRIVERS)}",
+        help=f"zip of a model, checkpoint, folder of a training run, or a trained driver: {', '.join(driver_names())}",
     )
     parser.add_argument("--out", type=Path, default=Path("drive.mp4"), help=".mp4, .gif or .html; default: %(default)s")
     parser.add_argument("--env", help=f"environment id; default: that of the run, or {ENV_ID}")
@@ -216,7 +216,7 @@ def watch(args: argparse.Namespace) -> Recording:
     model: Predictor
     config: Mapping[str, Any] = {}
     statistics = args.vecnormalize
-    if str(args.model) in DRIVERS and not args.model.exists():
+    if str(args.model) in driver_names() and not args.model.exists():
         model = pretrained(str(args.model), args.device)
         env_id, env_kwargs = args.env or model.card["env_id"], model.env_kwargs
     else:

@@ -111,7 +111,10 @@ class Week(RuleBasedStateMachine):
     def resume(self) -> None:
         save_checkpoint(self.model, self.path / "checkpoint")
         old, self.model = self.model, load_checkpoint(self.path / "checkpoint", self.make_env(), device="cpu")
-        assert self.model.num_timesteps == old.num_timesteps and len(self.model.replay_buffer) == len(old.replay_buffer)
+        assert (
+            self.model.num_timesteps == old.num_timesteps
+            and self.model.replay_buffer.size() == old.replay_buffer.size()
+        )
         old.get_env().close()
 
     @rule()

@@ -22,8 +22,6 @@ from sb3_have.export.config import MAX_SIZE, build, describe
 from sb3_have.have.policies import MultiModalPolicy
 
 FOLDER = Path(__file__).parent
-DRIVERS = tuple(sorted(file.stem for file in FOLDER.glob("*.json")))
-"""Names of the drivers."""
 
 
 class PretrainedPolicy(BasePolicy):
@@ -63,6 +61,11 @@ class PretrainedPolicy(BasePolicy):
         return dict(zip(self.encoder.modalities, weights.T, strict=True))
 
 
+def driver_names() -> list[str]:
+    """Return the names of the trained drivers."""
+    return sorted(file.stem for file in FOLDER.glob("*.json"))
+
+
 def pretrained(name: str = "have", device: th.device | str = "auto") -> PretrainedPolicy:
     """
     Load a trained driver of ``HighwayVision-v0``::
@@ -78,8 +81,8 @@ def pretrained(name: str = "have", device: th.device | str = "auto") -> Pretrain
     """
     from safetensors.torch import load_file
 
-    if name not in DRIVERS:
-        raise ValueError(f"there is no driver {name!r}, only {', '.join(DRIVERS)}")
+    if name not in driver_names():
+        raise ValueError(f"there is no driver {name!r}, only {', '.join(driver_names())}")
     card = json.loads((FOLDER / f"{name}.json").read_text())
     # The random initial weights must not use up the caller's random numbers
     with th.random.fork_rng(devices=[]):
