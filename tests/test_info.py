@@ -1,10 +1,10 @@
 """What a bug report gets from ``python -m sb3_have.info``."""
 
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import pytest
-import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.utils import get_device
 
@@ -17,7 +17,7 @@ def test_report(capsys: pytest.CaptureFixture[str]) -> None:
     main([])
     lines = dict(line.split(": ", 1) for line in capsys.readouterr().out.splitlines())
     assert lines["sb3_have"].startswith(sb3_have.__version__)
-    assert lines["torch"] == th.__version__
+    assert lines["torch"] == version("torch")
     count, folder = lines["configurations"].split(" in ")
     assert len(list(Path(folder).glob("*.yml"))) == int(count) + 1  # shared.yml is the Zoo's
 
