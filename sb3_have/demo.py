@@ -88,9 +88,8 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
         recording = record_episode(trained, ENV_ID, SHOWN, env_kwargs=trained.env_kwargs, max_steps=SHOWN_STEPS)
         show(recording, out / "trained")
 
-    # The learning rate decays to 0 over the training
     config = load_config("have", ENV_ID)
-    config["learning_rate"] = f"lin_{config['learning_rate']}"
+    config["learning_rate"] = Decay(config["learning_rate"], time_limit)
     config["env_kwargs"] = {**config["env_kwargs"], "image_size": IMAGE_SIZE}
     config["callback"] = {"sb3_have.demo.DistanceLine": {"steps": steps}}
     run = Run(config, ENV_ID, out, seed=seed, eval_freq=0, save_freq=0, time_limit=time_limit)
@@ -151,6 +150,25 @@ def show(recording: Recording, path: Path) -> None:
     write_gif(recording, path.with_suffix(".gif"))
     write_page(recording, path.with_suffix(".html"), ACTIONS)
     print(f"{recording.end['distance']:.0f} m: see {path}.gif, or open {path}.html in a browser")
+
+
+class Decay:
+    """
+    Learning rate schedule that decays linearly to 0 over the steps or the time of a training, whichever ends first.
+
+    :param initial_value: Initial learning rate
+    :param seconds: Limit of the training [s], counted from the first call
+    """
+
+    def __init__(self, initial_value: float, seconds: float) -> None:
+        self.initial_value, self.seconds = initial_value, seconds
+        self.started: float | None = None
+
+    def __call__(self, progress_remaining: float) -> float:
+        if self.started is None:
+            self.started = time.monotonic()
+        time_remaining = 1 - (time.monotonic() - self.started) / self.seconds
+        return self.initial_value * max(0.0, min(progress_remaining, time_remaining))
 
 
 class DistanceLine(BaseCallback):
