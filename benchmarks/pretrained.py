@@ -35,15 +35,15 @@ SEED = 4_000_000
 EPISODES = 5
 
 
-def drive(name: str, policy: PretrainedPolicy, processes: int) -> pd.DataFrame:
+def drive(name: str, policy: PretrainedPolicy, processes: int, episodes: int, seed: int) -> pd.DataFrame:
     """Drive the driver's episodes: a row per episode."""
-    print(f"{name}: {EPISODES} episodes in each of {len(WEATHERS)} weathers")
+    print(f"{name}: {episodes} episodes in each of {len(WEATHERS)} weathers")
     return evaluate_episodes(
         policy,
         ENV_ID,
         WEATHERS,
-        EPISODES,
-        SEED,
+        episodes,
+        seed,
         policy.env_kwargs,
         n_envs=processes,
         progress_bar=True,
@@ -82,7 +82,7 @@ def make(run: Path, name: str, commit: str, command: str, processes: int) -> Non
         },
     }
     save_driver(model.policy, name, card)
-    card["evaluation"] = summary(drive(name, pretrained(name), processes))
+    card["evaluation"] = summary(drive(name, pretrained(name), processes, EPISODES, SEED))
     save_driver(model.policy, name, card)
     print(card["evaluation"])
 
@@ -90,8 +90,10 @@ def make(run: Path, name: str, commit: str, command: str, processes: int) -> Non
 def check(name: str, processes: int) -> bool:
     """Return whether the mean distance is within the interval of the JSON file."""
     policy = pretrained(name)
-    found = summary(drive(name, policy, processes))["distance_mean_lower_upper"]["all"][0]
-    stated, lower, upper = policy.card["evaluation"]["distance_mean_lower_upper"]["all"]
+    card = policy.card["evaluation"]
+    episodes = drive(name, policy, processes, card["episodes_per_weather"], card["seed"])
+    found = summary(episodes)["distance_mean_lower_upper"]["all"][0]
+    stated, lower, upper = card["distance_mean_lower_upper"]["all"]
     print(f"{name}: {found:.1f} m, stated {stated:.1f} m [{lower:.1f}, {upper:.1f}]")
     return bool(lower <= found <= upper)
 

@@ -73,7 +73,7 @@ def config_path(name: str | Path) -> Path:
     :param name: Path of a file, or name of a configuration in ``zoo_configs`` ("have")
     :raises FileNotFoundError: If there is neither
     """
-    for path in (Path(name), _folder() / f"{name}.yml"):
+    for path in (Path(name), config_folder() / f"{name}.yml"):
         if path.is_file():
             return path
     raise FileNotFoundError(f"there is no configuration {str(name)!r}{suggest(str(name), config_names())}")
@@ -81,10 +81,11 @@ def config_path(name: str | Path) -> Path:
 
 def config_names() -> list[str]:
     """Return the names of the configurations in ``zoo_configs``, sorted."""
-    return sorted(path.stem for path in _folder().glob("*.yml") if path.stem != "shared")
+    return sorted(path.stem for path in config_folder().glob("*.yml") if path.stem != "shared")
 
 
-def _folder() -> Path:
+def config_folder() -> Path:
+    """Return the folder of the configurations that come with the package."""
     # zoo_configs lies inside the package in a wheel and beside it in a checkout
     inside = Path(__file__).parent / "zoo_configs"
     return inside if inside.is_dir() else Path(__file__).parents[1] / "zoo_configs"

@@ -3,8 +3,8 @@ Show a trained driver, train another one for a few minutes, and compare them wit
 
     python -m sb3_have.demo [--steps N] [--seed S] [--out runs/demo]
 
-The road is winding ("curves"), so that a driver has to look: straight ahead it ends after about 110 m. Images are
-smaller and the training is shorter than in ``zoo_configs/have.yml``; use :mod:`sb3_have.train` for the whole of it.
+The road is winding ("curves"): a driver that goes straight leaves it after about 110 m. Images are smaller and the
+training is shorter than in ``zoo_configs/have.yml``; use :mod:`sb3_have.train` for a full training.
 """
 
 from __future__ import annotations
@@ -35,6 +35,7 @@ from sb3_have.evaluation.recording import Recording, record_episode
 from sb3_have.plotting import plot_learning_curve, plot_modality_weights, write_gif, write_page
 from sb3_have.train import Run
 from sb3_have.trained import pretrained
+from sb3_have.watch import ACTIONS
 
 ENV_ID, RULES_ID = "HighwayVision-v0", "RuleDriven-v0"
 STEPS, IMAGE_SIZE = 12_000, 36
@@ -45,7 +46,6 @@ PROCESSES = 2
 SHOWN = "HardRainNight"
 # 20 seconds
 SHOWN_STEPS = 100
-ACTIONS = ("throttle", "steering")
 NAME = "this HAVESAC"
 
 
@@ -93,7 +93,7 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
     config["env_kwargs"] = {**config["env_kwargs"], "image_size": IMAGE_SIZE}
     config["callback"] = {"sb3_have.demo.DistanceLine": {"steps": steps}}
     run = Run(config, ENV_ID, out, seed=seed, eval_freq=0, save_freq=0, time_limit=time_limit)
-    with phase(f"Training for {steps} steps or {time_limit / 60:g} minutes (Ctrl-C to stop earlier)"):
+    with phase(f"Training for {steps} steps or {time_limit / 60:g} minutes (press Ctrl-C once to stop earlier)"):
         model = run.train(steps, keep_checkpoint=False)
         if not (out / "model.zip").exists():  # interrupted twice, or before the first step
             raise KeyboardInterrupt
@@ -127,7 +127,7 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
             table = pd.concat(results, names=["driver"]).reset_index(level="driver").reset_index(drop=True)
             table.to_csv(out / "evaluation.csv", index=False)
         print(format_table(results))
-        print("IDM/MOBIL is told where the traffic is; the other drivers have to look, or do not.")
+        print("IDM/MOBIL knows where the traffic is. HAVESAC only sees images, and random and straight see nothing.")
 
     with phase("Drawing"):
         others = {name: float(rows["distance_mean"].mean()) for name, rows in results.items() if name != NAME}
@@ -164,6 +164,9 @@ class Decay:
         self.initial_value, self.seconds = initial_value, seconds
         self.started: float | None = None
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "started": None}
+
     def __call__(self, progress_remaining: float) -> float:
         if self.started is None:
             self.started = time.monotonic()
@@ -175,14 +178,14 @@ class DistanceLine(BaseCallback):
     """
     Callback that shows the distance of the training episodes over the steps, as a line of small bars.
 
-    The highest bar stands for the largest distance so far. In a terminal, the line is drawn anew at the end of each
-    episode; elsewhere it is printed ten times in the training.
+    The highest bar stands for the largest distance so far. In a terminal, the line is redrawn at the end of each
+    episode; elsewhere it is printed ten times during the training.
 
     :param steps: Number of training steps
     """
 
     BARS = " ▁▂▃▄▅▆▇█"
-    WIDTH = 40
+    WIDTH = 30
 
     def __init__(self, steps: int) -> None:
         super().__init__()
@@ -213,7 +216,7 @@ class DistanceLine(BaseCallback):
         means = sums / np.maximum(1, counts)
         levels = np.ceil(means / max(1.0, means.max()) * (len(self.BARS) - 1)).astype(int)
         last = [distance for _, distance in self.episodes[-10:]]
-        mean = f"{np.mean(last):5.0f} m in the last {len(last)} episodes" if last else ""
+        mean = f"{np.mean(last):5.0f} m (mean of last {len(last)})" if last else ""
         return f"step {self.num_timesteps:6d} |{''.join(self.BARS[level] for level in levels)}| {mean}"
 
 

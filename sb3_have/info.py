@@ -17,7 +17,7 @@ from stable_baselines3.common.utils import get_device
 
 from sb3_have.benchmark.provenance import machine
 from sb3_have.common.encoders import has_native_bfloat16
-from sb3_have.configuration import config_names, config_path
+from sb3_have.configuration import config_folder, config_names
 
 
 def info() -> dict[str, str]:
@@ -33,7 +33,7 @@ def info() -> dict[str, str]:
         "device": f"{device.type} (auto)",
         "precision": f"{'bfloat16' if has_native_bfloat16(device.type) else 'float32'} (auto)",
         "extras": ", ".join(extra for extra in extras if has_extra("sb3_have", extra)) or "none",
-        "configurations": f"{len(config_names())} in {config_path('have').parent}",
+        "configurations": f"{len(config_names())} in {config_folder()}",
     }
 
 

@@ -29,7 +29,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_have.algorithms import ALGORITHMS, saved_algorithm
 from sb3_have.checkpoint.archive import DamagedCheckpointError
 from sb3_have.checkpoint.checkpoint import checkpoint_info, checkpoints
-from sb3_have.configuration import env_wrapper, hyperparameter, load_config
+from sb3_have.configuration import env_wrapper, hyperparameter, load_config, suggest
 from sb3_have.envs.vision import MODALITIES
 from sb3_have.evaluation.episodes import Predictor
 from sb3_have.evaluation.recording import Recording, record_episode
@@ -57,7 +57,10 @@ def model_file(path: Path) -> Path:
     for candidate in candidates:
         if candidate.is_file():
             return candidate
-    raise FileNotFoundError(f"{path} is neither a model nor a folder with model.zip or checkpoints")
+    raise FileNotFoundError(
+        f"{path} is neither a model, nor a folder with model.zip or checkpoints, nor a trained driver"
+        + suggest(str(path), driver_names())
+    )
 
 
 def read_model(file: Path) -> tuple[io.BytesIO, dict[str, Any]]:

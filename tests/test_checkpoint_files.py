@@ -171,7 +171,7 @@ def test_a_disk_that_is_too_small_is_noticed_at_the_start(tmp_path: Path, monkey
         monkeypatch.setattr(shutil, "disk_usage", lambda _, free=needed: SimpleNamespace(free=free))
         model.learn(steps, ResumableCheckpointCallback(tmp_path / f"{needed}", 1000))
         monkeypatch.setattr(shutil, "disk_usage", lambda _, free=needed - 1: SimpleNamespace(free=free))
-        with pytest.warns(UserWarning, match=r"3 checkpoints in .* may need 0\.0 GB, and the disk has 0\.0 GB left"):
+        with pytest.warns(UserWarning, match=r"3 checkpoints in .* may need \d MB, and the disk has \d MB left"):
             model.learn(steps, ResumableCheckpointCallback(tmp_path / f"{needed} less", 1000))
 
 

@@ -151,7 +151,7 @@ def test_discrete_observations_are_exported(space: spaces.Space[Any], tmp_path: 
 
 def test_matrices_of_choices_are_refused() -> None:
     with pytest.raises(ValueError, match=r"'gear': expected a MultiDiscrete of one axis"):
-        tiny_model(spaces.Dict({"gear": spaces.MultiDiscrete([[2, 3], [2, 2]])}))
+        tiny_model(spaces.Dict({"gear": spaces.MultiDiscrete(np.array([[2, 3], [2, 2]]))}))
 
 
 def test_a_single_discrete_observation() -> None:

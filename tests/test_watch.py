@@ -226,7 +226,7 @@ def refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> str:
 def test_what_cannot_be_watched(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = ["--out", str(tmp_path / "a.gif")]
     (tmp_path / "text.zip").write_text("no model")
-    assert "nothing is neither a model nor a folder" in refused([str(tmp_path / "nothing"), *out], capsys)
+    assert "nothing is neither a model, nor a folder" in refused([str(tmp_path / "nothing"), *out], capsys)
     assert "not a model that SB3 saved" in refused([str(tmp_path / "text.zip"), *out], capsys)
     assert "ends in .mp4, .gif or .html" in refused([str(run), "--out", "film.avi"], capsys)
     assert "max_steps=0" in refused([str(run), *out, "--steps", "0"], capsys)

@@ -111,12 +111,14 @@ class ResumableCheckpointCallback(BaseCallback):
         observation = sum(part.dtype.itemsize * int(np.prod(part.shape)) for part in parts)
         # SB3's buffers store each observation twice, and all of its stacked frames
         copies = 1 / model.replay_buffer.n_stack if isinstance(model.replay_buffer, ModalityReplayBuffer) else 2
-        needed = (self.keep + 1) * steps * observation * copies
+        # Checkpoints that are already there will be replaced, and each is written before an old one is removed
+        new = max(1, self.keep + 1 - len(checkpoints(self.folder)))
+        needed = new * steps * observation * copies
         free = shutil.disk_usage(self.folder).free
         if needed > free:
             warnings.warn(
-                f"{self.keep + 1} checkpoints in {self.folder} may need {needed / 1e9:.1f} GB, and the disk has "
-                f"{free / 1e9:.1f} GB left: make room, choose another folder, or a smaller buffer_size.",
+                f"{new} checkpoints in {self.folder} may need {needed / 1e6:,.0f} MB, and the disk has "
+                f"{free / 1e6:,.0f} MB left: make room, choose another folder or reduce buffer_size.",
                 stacklevel=2,
             )
 

@@ -20,6 +20,7 @@ from sb3_contrib.crossq.policies import CrossQPolicy
 from sb3_contrib.tqc import policies as tqc
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import CombinedExtractor, FlattenExtractor, NatureCNN
 from stable_baselines3.common.utils import ConstantSchedule
 from stable_baselines3.sac import policies as sac
@@ -227,6 +228,8 @@ def _space_from_json(value: Any, place: str) -> spaces.Space[Any]:
             raise ValueError(f"more than {MAX_SIZE} numbers")
         # Gymnasium sorts the keys of a plain dict
         found: dict[str, spaces.Space[Any]] = OrderedDict((str(key), _part_from_json(part)) for key, part in parts)
+        if sum(get_flattened_obs_dim(part) for part in found.values()) > MAX_SIZE:
+            raise ValueError(f"more than {MAX_SIZE} numbers")
     except Exception as error:  # whatever a damaged file leads to
         raise ValueError(f"{place} is damaged: {error}") from error
     return spaces.Dict(found) if value["type"] == "Dict" else found[""]

@@ -120,7 +120,7 @@ def _panels(recording: Recording, actions: Sequence[str]) -> list[dict[str, Any]
         panels.append(_panel("speed", [_single(speeds)], "m/s", (0,)))
     entries = recording.actions.reshape(len(recording.infos), -1).T
     if actions and len(actions) != len(entries):
-        raise ValueError(f"{len(actions)} names for actions of {len(entries)} entries")
+        raise ValueError(f"actions: expected {len(entries)} names, got {list(actions)}")
     if actions:
         for name, entry in zip(actions, entries, strict=True):
             panels.append(_panel(name, [_single(entry)], include=(0,)))

@@ -7,6 +7,7 @@ describes the policy, its training and its distance in each weather. Nothing is 
 
 from __future__ import annotations
 
+import copy
 import json
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from stable_baselines3.common.utils import get_device
 
 from sb3_have.checkpoint.files import write_atomically
+from sb3_have.configuration import suggest
 from sb3_have.export.config import MAX_SIZE, build, describe
 from sb3_have.have.policies import MultiModalPolicy
 
@@ -28,7 +30,8 @@ class PretrainedPolicy(BasePolicy):
     """
     The part of a :class:`~sb3_have.MultiModalPolicy` that acts: encoder, actor and assignment network.
 
-    It has no critics, so it gives actions and modality weights but no Q-values.
+    It has no critics, so it gives actions and modality weights but no Q-values. Load it by :func:`pretrained`; SB3's
+    ``save`` and ``load`` do not work with it.
 
     :param policy: Policy with all networks; those that act are shared with it
     :param card: Content of the driver's JSON file: ``env_id``, ``env_kwargs``, ``training`` and ``evaluation``
@@ -42,7 +45,7 @@ class PretrainedPolicy(BasePolicy):
     @property
     def env_kwargs(self) -> dict[str, Any]:
         """Keyword arguments of the environment that the driver was trained in, without the weather."""
-        return dict(self.card["env_kwargs"])
+        return copy.deepcopy(self.card["env_kwargs"])
 
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         action: th.Tensor = self.actor(self.encoder(observation).flatten(start_dim=1), deterministic)
@@ -82,7 +85,7 @@ def pretrained(name: str = "have", device: th.device | str = "auto") -> Pretrain
     from safetensors.torch import load_file
 
     if name not in driver_names():
-        raise ValueError(f"there is no driver {name!r}, only {', '.join(driver_names())}")
+        raise ValueError(f"there is no driver {name!r}{suggest(name, driver_names())}")
     card = json.loads((FOLDER / f"{name}.json").read_text())
     # The random initial weights must not use up the caller's random numbers
     with th.random.fork_rng(devices=[]):
