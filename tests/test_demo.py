@@ -5,20 +5,36 @@ import time
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import pandas as pd
 import pytest
+import torch as th
 from fake_drive import CONFIG, ENV_ID, FakeDrive
+from gymnasium import spaces
 from PIL import Image
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_have import HAVESAC, demo, evaluate
+from sb3_have.common.encoders import MultiModalEncoder
 from sb3_have.envs.drivers import RandomDriver
+from sb3_have.train import make_training_env
 
 
 class Coaster(RandomDriver):
     """Stands for the trained driver of the package."""
 
     env_kwargs: ClassVar[dict[str, Any]] = {}
+
+    def __init__(self) -> None:
+        super().__init__()
+        images: dict[str, Any] = {
+            key: spaces.Box(0, 255, (2 * n, 36, 36), np.uint8) for key, n in {"rgb": 3, "depth": 1}.items()
+        }
+        with th.random.fork_rng():
+            self.encoder = MultiModalEncoder(spaces.Dict(images), 4)
+
+
+COASTER = Coaster()
 
 
 @pytest.fixture(autouse=True)
@@ -32,7 +48,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         "SHOWN": "fast",
         "SubprocVecEnv": DummyVecEnv,
     }
-    functions = {"load_config": lambda *_: dict(config), "pretrained": lambda _: Coaster()}
+    functions = {"load_config": lambda *_: dict(config), "pretrained": lambda *_: COASTER}
     for name, value in {**constants, **functions}.items():
         monkeypatch.setattr(demo, name, value)
 
@@ -54,6 +70,16 @@ def test_the_demo_writes_all_of_its_results_and_can_be_repeated(
         with Image.open(tmp_path / name) as picture:
             assert picture.width > 100
     assert (tmp_path / "trained.html").exists() and (tmp_path / "drive.html").exists()
+
+
+def test_training_begins_with_the_trained_encoders() -> None:
+    env = make_training_env(ENV_ID, CONFIG)
+    policy_kwargs = {"features_dim": 4, "net_arch": [8]}
+    model = HAVESAC("MultiInputPolicy", env, learning_starts=100, buffer_size=50, policy_kwargs=policy_kwargs)
+    model.learn(1, demo.TrainedEncoders())
+    for critic in (model.critic, model.critic_target):
+        for name, tensor in COASTER.encoder.state_dict().items():
+            assert th.equal(critic.encoder.state_dict()[name].cpu(), tensor), name
 
 
 def test_the_learning_rate_decays_over_steps_or_time(monkeypatch: pytest.MonkeyPatch) -> None:
