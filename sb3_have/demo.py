@@ -93,9 +93,8 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
     config["learning_rate"] = Decay(config["learning_rate"], time_limit)
     config["callback"] = ["sb3_have.demo.TrainedEncoders", {"sb3_have.demo.DistanceLine": {"steps": steps}}]
     run = Run(config, ENV_ID, out, seed=seed, eval_freq=0, save_freq=0, time_limit=time_limit)
-    with phase(
-        f"Training on the encoders of that driver for {steps} steps or {time_limit / 60:g} minutes (press Ctrl-C once to stop earlier)"
-    ):
+    limits = f"{steps} steps or {time_limit / 60:g} minutes"
+    with phase(f"Training on its encoders for {limits} (press Ctrl-C once to stop earlier)"):
         model = run.train(steps, keep_checkpoint=False)
         if not (out / "model.zip").exists():  # interrupted twice, or before the first step
             raise KeyboardInterrupt
