@@ -41,7 +41,7 @@ from sb3_have.watch import ACTIONS
 ENV_ID, RULES_ID = "HighwayVision-v0", "RuleDriven-v0"
 STEPS = 12_000
 # Limit of the training, so that the demo takes at most ten minutes
-MINUTES = 7.5
+MINUTES = 7.0
 EPISODES = 1
 PROCESSES = 2
 SHOWN = "HardRainNight"
