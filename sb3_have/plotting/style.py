@@ -135,8 +135,9 @@ def draw_levels(axis: Axes, levels: Mapping[str, float]) -> None:
     :param axis: Axis to draw on
     :param levels: Height of each line by label
     """
+    lines: list[Any] = ["--", ":", "-.", (0, (12, 3))]
     for i, (name, level) in enumerate(levels.items()):
-        axis.axhline(level, color="0.35", linestyle=("--", ":", "-.")[i % 3], linewidth=1, label=name, zorder=1)
+        axis.axhline(level, color="0.35", linestyle=lines[i % len(lines)], linewidth=1, label=name, zorder=1)
 
 
 def legend_above(figure: Figure, handles: Sequence[Any], labels: Sequence[str], columns: int = 8) -> None:
