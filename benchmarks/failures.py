@@ -1,7 +1,7 @@
 """Measure how far a trained model drives when one of its sensors fails for whole episodes.
 
-    python -m sb3_have.demo                                              # trains a model
-    python -m benchmarks.failures runs/demo/havesac_demo.zip --config have-50k
+    python -m sb3_have.train --config have-50k --out runs/have-0         # trains a model
+    python -m benchmarks.failures runs/have-0/model.zip --config have-50k
 
 Each of rgb, event and depth fails in every way that it can, at one severity, outside the configuration's own
 ``env_wrapper``. All cases have the same episodes, in all weathers. Each row is appended to the CSV file when it is

@@ -41,7 +41,7 @@ from sb3_have.watch import ACTIONS
 ENV_ID, RULES_ID = "HighwayVision-v0", "RuleDriven-v0"
 STEPS = 12_000
 # Limit of the training, so that the demo takes at most ten minutes
-MINUTES = 7.0
+MINUTES = 7.5
 EPISODES = 1
 PROCESSES = 2
 SHOWN = "HardRainNight"
@@ -128,6 +128,7 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
             table = pd.concat(results, names=["driver"]).reset_index(level="driver").reset_index(drop=True)
             table.to_csv(out / "evaluation.csv", index=False)
         print(format_table(results))
+        print("ER: reward of an episode, D: its distance, in the mean over the episodes of a weather.")
         print("IDM/MOBIL knows where the traffic is. HAVESAC only sees images, and random and straight see nothing.")
 
     with phase("Drawing"):
