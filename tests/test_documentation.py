@@ -130,7 +130,9 @@ def test_only_what_cannot_run_here_is_left_out() -> None:
     comments = [text for page in PAGES for text in re.findall("<!--.*?-->", page.read_text(), re.S)]
     assert len(comments) == sum(block.reason is not None for page in PAGES for block in blocks(page)), comments
     languages = {block.language.split()[0] for page in PAGES for block in blocks(page)}
-    assert languages <= {"python", "bash", "yaml", "bibtex", "{toctree}", "{eval-rst}", "{include}"}, languages
+    assert languages <= {"python", "bash", "yaml", "bibtex", "html", "{raw}", "{toctree}", "{eval-rst}", "{include}"}, (
+        languages
+    )
 
 
 @pytest.mark.parametrize("page", pages_with("yaml"), ids=name_of)
