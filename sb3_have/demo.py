@@ -181,8 +181,9 @@ class TrainedEncoders(BaseCallback):
 
     def _on_training_start(self) -> None:
         model: Any = self.model
+        trained = pretrained("have", model.device).encoder.state_dict()
         for critic in (model.critic, model.critic_target):
-            critic.encoder.load_state_dict(pretrained("have", model.device).encoder.state_dict())
+            critic.encoder.load_state_dict(trained)
 
     def _on_step(self) -> bool:
         return True

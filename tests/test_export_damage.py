@@ -96,13 +96,16 @@ CONFIG: dict[str, tuple[Damage, str]] = {
     "action dtype": (set_in("action_space", "dtype", value="object"), "action_space is damaged: .*dtype object"),
     "huge dtype": (set_in("action_space", "dtype", value="V2000000000"), "action_space is damaged: .*dtype V2"),
     "action type": (
-        set_in("action_space", value={"type": "Discrete", "n": 3, "start": 0}),
+        set_in("action_space", value={"type": "Discrete", "n": 3, "start": 0, "dtype": "int64"}),
         "expected a Box, got Discr",
     ),
     "space type": (set_in("action_space", "type", value="Text"), "action_space is damaged: unknown space Text"),
-    "space of choices": (set_in("observation_space", value={"type": "Discrete", "n": 0, "start": 0}), "is damaged"),
+    "space of choices": (
+        set_in("observation_space", value={"type": "Discrete", "n": 0, "start": 0, "dtype": "int64"}),
+        "is damaged",
+    ),
     "huge space of choices": (
-        set_in("observation_space", value={"type": "Discrete", "n": 2 * 10**8, "start": 0}),
+        set_in("observation_space", value={"type": "Discrete", "n": 2 * 10**8, "start": 0, "dtype": "int64"}),
         "observation_space is damaged: more than",
     ),
     "huge space of bits": (

@@ -66,7 +66,7 @@ def titles(page: Path) -> list[str]:
 
 
 def test_page_of_three_noisy_sensors_is_small_and_needs_nothing_else(tmp_path: Path) -> None:
-    """The worst case of 500 steps at 64 pixels, of which a twentieth is written."""
+    """Write a twentieth of the worst case, which is 500 steps of noise at 64 pixels."""
     rng, recording = np.random.default_rng(0), Recording("", 0.2, infos=[{}] * 25)
     for _ in recording.infos:
         noise = {name: rng.integers(0, 256, (64, 64, shape[-1]), np.uint8) for name, shape in SENSORS.items()}

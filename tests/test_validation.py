@@ -109,6 +109,7 @@ DISCRETE: list[spaces.Space[Any]] = [
     spaces.Discrete(3, start=-1),
     spaces.MultiDiscrete([2, 3]),
     spaces.MultiDiscrete([2, 3], start=[1, 4]),
+    spaces.MultiDiscrete([2, 3], dtype=np.int32),
     spaces.MultiBinary(4),
 ]
 

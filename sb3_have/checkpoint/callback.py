@@ -103,7 +103,7 @@ class ResumableCheckpointCallback(BaseCallback):
                 )
 
     def _warn_if_disk_is_small(self) -> None:
-        """Estimate the size of the checkpoints, most of which is the replay buffer."""
+        """Warn if the checkpoints may not fit. The replay buffer takes most of their space."""
         model: Any = self.model
         steps = min(model.buffer_size, self.locals["total_timesteps"])
         space = model.observation_space

@@ -205,9 +205,10 @@ def _space_to_json(space: spaces.Space[Any]) -> dict[str, Any]:
     if isinstance(space, spaces.Dict):
         return {"type": "Dict", "spaces": [[key, _space_to_json(item)] for key, item in space.spaces.items()]}
     if isinstance(space, spaces.Discrete):
-        return {"type": "Discrete", "n": int(space.n), "start": int(space.start)}
+        return {"type": "Discrete", "n": int(space.n), "start": int(space.start), "dtype": str(space.dtype)}
     if isinstance(space, spaces.MultiDiscrete):
-        return {"type": "MultiDiscrete", "nvec": space.nvec.tolist(), "start": space.start.tolist()}
+        choices = {"nvec": space.nvec.tolist(), "start": space.start.tolist()}
+        return {"type": "MultiDiscrete", **choices, "dtype": str(space.dtype)}
     if isinstance(space, spaces.MultiBinary):
         return {"type": "MultiBinary", "n": space.n if isinstance(space.n, int) else list(space.n)}
     if not isinstance(space, spaces.Box):
@@ -238,9 +239,9 @@ def _space_from_json(value: Any, place: str) -> spaces.Space[Any]:
 def _part_from_json(value: Any) -> spaces.Space[Any]:
     match value["type"]:
         case "Discrete":
-            return spaces.Discrete(value["n"], start=value["start"])
+            return spaces.Discrete(value["n"], start=value["start"], dtype=_number(value["dtype"]))
         case "MultiDiscrete":
-            return spaces.MultiDiscrete(value["nvec"], start=value["start"])
+            return spaces.MultiDiscrete(value["nvec"], dtype=_number(value["dtype"]), start=value["start"])
         case "MultiBinary":
             return spaces.MultiBinary(value["n"])
         case "Box":
@@ -249,9 +250,15 @@ def _part_from_json(value: Any) -> spaces.Space[Any]:
             raise ValueError(f"unknown space {kind}")
 
 
-def _box_from_json(value: Any) -> spaces.Box:
-    dtype = np.dtype(value["dtype"])
+def _number(name: str) -> Any:
+    """Return the type of a number by its name."""
+    dtype = np.dtype(name)
     if dtype.kind not in "biuf" or dtype.itemsize > 8:
-        raise ValueError(f"expected a Box of numbers, got dtype {value['dtype']}")
+        raise ValueError(f"expected numbers, got dtype {name}")
+    return dtype.type
+
+
+def _box_from_json(value: Any) -> spaces.Box:
+    dtype = _number(value["dtype"])
     low, high = (np.broadcast_to(np.asarray(value[name], dtype), value["shape"]) for name in ("low", "high"))
-    return spaces.Box(low, high, dtype=dtype.type)
+    return spaces.Box(low, high, dtype=dtype)

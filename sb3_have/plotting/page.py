@@ -38,7 +38,7 @@ def write_page(recording: Recording, path: Path | str, actions: Sequence[str] = 
 
     :param recording: Episode to show
     :param path: Name of the file
-    :param actions: Names of the A entries of an action, each of which gets curves of its own. By default they are
+    :param actions: Names of the A entries of an action. Each of them gets its own panel. By default they are
         "action 0", "action 1" and so on, in one panel.
     :raises ValueError: If the recording is empty, or if there are more or fewer names than entries
     """
