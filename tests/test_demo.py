@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_have import HAVESAC, demo, evaluate
 from sb3_have.common.encoders import MultiModalEncoder
 from sb3_have.envs.drivers import RandomDriver
-from sb3_have.train import make_training_env
+from sb3_have.trained import features
 
 
 class Coaster(RandomDriver):
@@ -47,10 +47,12 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         "WEATHERS": ("slow", "fast"),
         "SHOWN": "fast",
         "SubprocVecEnv": DummyVecEnv,
+        "CHANGES": {"auxiliary": None},
     }
     functions = {"load_config": lambda *_: dict(config), "pretrained": lambda *_: COASTER}
     for name, value in {**constants, **functions}.items():
         monkeypatch.setattr(demo, name, value)
+    monkeypatch.setattr(features, "pretrained", lambda *_: COASTER)
 
 
 def test_the_demo_writes_all_of_its_results_and_can_be_repeated(
@@ -70,16 +72,6 @@ def test_the_demo_writes_all_of_its_results_and_can_be_repeated(
         with Image.open(tmp_path / name) as picture:
             assert picture.width > 100
     assert (tmp_path / "trained.html").exists() and (tmp_path / "drive.html").exists()
-
-
-def test_training_begins_with_the_trained_encoders() -> None:
-    env = make_training_env(ENV_ID, CONFIG)
-    policy_kwargs = {"features_dim": 4, "net_arch": [8]}
-    model = HAVESAC("MultiInputPolicy", env, learning_starts=100, buffer_size=50, policy_kwargs=policy_kwargs)
-    model.learn(1, demo.TrainedEncoders())
-    for critic in (model.critic, model.critic_target):
-        for name, tensor in COASTER.encoder.state_dict().items():
-            assert th.equal(critic.encoder.state_dict()[name].cpu(), tensor), name
 
 
 def test_the_learning_rate_decays_over_steps_or_time(monkeypatch: pytest.MonkeyPatch) -> None:
