@@ -132,6 +132,7 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
     results = {}
     with phase(f"Evaluating {len(drivers)} drivers, {n_episodes} episodes in each of {len(WEATHERS)} weathers"):
         for name, (driver, env_id, kwargs) in drivers.items():
+            print(f"{name}:", flush=True)
             results[name] = evaluate(
                 driver,
                 env_id,

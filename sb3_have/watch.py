@@ -181,13 +181,12 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--weather", help="weather of the episode; default: as in training")
     parser.add_argument("--seed", type=int, default=0, help="seed of the episode")
     parser.add_argument("--steps", type=int, help="largest number of steps; default: the whole episode")
-    parser.add_argument("--fps", type=float, help="frames per second; default: real time, but at least 10")
+    parser.add_argument("--fps", type=float, help="frames per second; default: real time")
     parser.add_argument("--width", type=int, default=640, help="width of the film [px]; default: %(default)s")
     parser.add_argument("--algo", choices=list(ALGORITHMS), help="default: the one that saved the model")
     parser.add_argument(
         "--config",
-        default="have",
-        help="configuration with the environment, if the settings of the run are unknown; default: %(default)s",
+        help="configuration with the environment, if the settings of the run are unknown; default: have",
     )
     parser.add_argument(
         "--vecnormalize", type=Path, metavar="FILE", help="file of VecNormalize.save(); default: vecnormalize.pkl"
@@ -220,12 +219,14 @@ def watch(args: argparse.Namespace) -> Recording:
     config: Mapping[str, Any] = {}
     statistics = args.vecnormalize
     if str(args.model) in driver_names() and not args.model.exists():
+        if args.algo or args.config:
+            raise ValueError(f"{args.model} is a trained driver, which needs neither --algo nor --config")
         model = pretrained(str(args.model), args.device)
         env_id, env_kwargs = args.env or model.card["env_id"], model.env_kwargs
     else:
         file = model_file(args.model)
         model, settings = load_model(file, args.algo, args.device)
-        env_id, env_kwargs, config = environment(model, settings, args.env, args.config)
+        env_id, env_kwargs, config = environment(model, settings, args.env, args.config or "have")
         statistics = statistics or statistics_file(file, env_id)
     env_kwargs |= dict(args.env_kwargs) | ({} if args.weather is None else {"weather": args.weather})
     normalizer = None if statistics is None else saved_normalizer(statistics)

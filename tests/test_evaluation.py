@@ -241,7 +241,7 @@ def test_table() -> None:
     lines = format_table({"HAVE": frame, "random": frame}).splitlines()
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
     assert cells[0] == ["weather", "", "HAVE", "random"]
-    assert cells[2][:3] == ["slow", "ER", "0.0 ± 0.0"]
+    assert cells[2][:3] == ["slow", "ER", "0.0"]  # one episode has no deviation
     assert cells[5][1:3] == ["D [m]", "20 ± 0"]
     # all: mean (0 + 3 * 4) / 4, variance (9 + 3 * (4 + 1)) / 4
     assert cells[6][:3] == ["all", "ER", "3.0 ± 2.4"]

@@ -235,6 +235,7 @@ def test_what_cannot_be_watched(run: Path, tmp_path: Path, capsys: pytest.Captur
     assert "no configuration 'nothing'" in refused(
         [str(run), *out, "--env", watch.ENV_ID, "--config", "nothing"], capsys
     )
+    assert "needs neither --algo nor --config" in refused(["have", *out, "--algo", "sac"], capsys)
     assert not list(tmp_path.glob("a.*"))
 
 

@@ -214,7 +214,8 @@ def format_table(results: Mapping[str, pd.DataFrame]) -> str:
     Format evaluations side by side, as in the paper's Table 1: episode reward (ER) and distance (D) by weather.
 
     :param results: From :func:`evaluate`, by driver; all over the same weathers
-    :return: A Markdown table of mean ± standard deviation; the last rows are over all episodes
+    :return: A Markdown table of mean ± standard deviation, or of the value of a single episode; the last rows are over
+        all episodes
     :raises ValueError: If the weathers differ
     """
     weathers = [list(frame["weather"]) for frame in results.values()]
@@ -226,7 +227,8 @@ def format_table(results: Mapping[str, pd.DataFrame]) -> str:
             cells = []
             for frame in results.values():
                 mean, std = frame.loc[i, [f"{name}_mean", f"{name}_std"]] if weather != "all" else pooled(frame, name)
-                cells.append(f"{mean:.{digits}f} ± {std:.{digits}f}")
+                n_episodes = frame["episodes"].sum() if weather == "all" else frame.loc[i, "episodes"]
+                cells.append(f"{mean:.{digits}f}" + (f" ± {std:.{digits}f}" if n_episodes > 1 else ""))
             rows.append([weather if label == "ER" else "", label, *cells])
     return markdown_table(["weather", "", *results], rows)
 

@@ -168,7 +168,7 @@ def write_animation(
 
     :param recording: Episode to show
     :param path: Name of the file, ending in .mp4 or .gif
-    :param fps: Frames per second; by default real time, but at least 10
+    :param fps: Frames per second; by default real time, or 10 if the length of a step is unknown
     :param width: Width of the frames [px]
     :param progress_bar: Display a progress bar
     """
@@ -178,14 +178,16 @@ def write_animation(
         raise ValueError(f"{path}: expected a name that ends in {' or '.join(writers)}")
     frames = Frames(recording, width)
     if fps is None:
-        fps = max(10.0, 1.0 / recording.seconds) if recording.seconds else 10.0
+        fps = 1.0 / recording.seconds if recording.seconds else GIF_FPS
     steps = tqdm(range(len(frames)), unit="frame", disable=not progress_bar)
     writers[path.suffix.lower()](path, (frames[step] for step in steps), fps)
 
 
 def write_gif(recording: Recording, path: Path | str, width: int = 480, max_bytes: int = 1_000_000) -> None:
     """
-    Write an episode as a small looped GIF with 10 frames per second, leaving out steps.
+    Write an episode as a small looped GIF, leaving out steps if it is long.
+
+    The frames follow each other as fast as the steps of the environment, but at most 10 in a second.
 
     :param recording: Episode to show
     :param path: Name of the file
@@ -194,9 +196,10 @@ def write_gif(recording: Recording, path: Path | str, width: int = 480, max_byte
     """
     frames = Frames(recording, width)
     stride = -(-len(frames) // MAX_FRAMES)
+    fps = min(GIF_FPS, 1.0 / recording.seconds) if recording.seconds else GIF_FPS
     while True:
         shown = range(0, len(frames), stride)
-        _write_gif(Path(path), (frames[step] for step in shown), GIF_FPS)
+        _write_gif(Path(path), (frames[step] for step in shown), fps)
         if Path(path).stat().st_size <= max_bytes or len(shown) == 1:
             return
         stride *= 2
