@@ -4,8 +4,8 @@ Show a trained driver, train another one for a few minutes, and compare them wit
     python -m sb3_have.demo [--steps N] [--seed S] [--out runs/demo]
 
 The road is winding ("curves"): a driver that goes straight leaves it after about 100 m. To learn to drive in a few
-minutes, the agent sees through the encoders of the trained driver, which stay as they are: critics, attention and actor
-start from nothing and learn on their features. Use :mod:`sb3_have.train` for a full training on images.
+minutes, the agent gets the encoders of the trained driver, which are frozen. Critics, attention and actor start from
+random weights and learn on their features. Use :mod:`sb3_have.train` for a full training on images.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.monitor import load_results
 from stable_baselines3.common.vec_env import SubprocVecEnv
 
+from sb3_have.checkpoint.files import write_atomically
 from sb3_have.common.memory import keep_freed_memory
 from sb3_have.configuration import evaluation_env_kwargs, load_config
 from sb3_have.envs.drivers import KeepStraightDriver, RandomDriver
@@ -41,14 +42,14 @@ from sb3_have.trained.features import on_features, with_encoders
 from sb3_have.watch import ACTIONS
 
 ENV_ID, RULES_ID = "HighwayVision-v0", "RuleDriven-v0"
-STEPS = 15_000
+STEPS = 20_000
 # Limit of the training, so that the demo takes at most ten minutes
-MINUTES = 7.5
+MINUTES = 7.0
 EPISODES = 1
 PROCESSES = 2
-# Of the configuration "have". Small networks and a few environments at a time make more steps in these minutes, and
-# DeepMDP's losses only train encoders.
-CHANGES = {
+# Changes to the configuration "have". Small networks and several environments allow more steps in this time, and
+# DeepMDP's losses would have no encoders to train.
+OVERRIDES = {
     "n_envs": 4,
     "train_freq": 1,
     "gradient_steps": 2,
@@ -56,6 +57,15 @@ CHANGES = {
     "auxiliary": None,
     "policy_kwargs": {"net_arch": [128, 128]},
 }
+RESULTS = (
+    "model.zip",
+    "havesac_demo.zip",
+    "evaluation.csv",
+    "learning_curve.png",
+    "modality_weights.png",
+    "drive.gif",
+    "drive.html",
+)
 SHOWN = "HardRainNight"
 # 20 seconds
 SHOWN_STEPS = 100
@@ -96,6 +106,9 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
     """
     started = time.monotonic()
     out.mkdir(parents=True, exist_ok=True)
+    # An interrupted demo must not leave the results of an earlier one beside its own
+    for name in RESULTS:
+        (out / name).unlink(missing_ok=True)
     # Leave the cores to the processes of the environments
     th.set_num_threads(1)
     trained = pretrained("have")
@@ -103,22 +116,20 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
         recording = record_episode(trained, ENV_ID, SHOWN, env_kwargs=trained.env_kwargs, max_steps=SHOWN_STEPS)
         show(recording, out / "trained")
 
-    config = load_config("have", ENV_ID) | CHANGES
+    config = load_config("have", ENV_ID) | OVERRIDES
     env_kwargs = evaluation_env_kwargs(config)
     config["learning_rate"] = Decay(config["learning_rate"], time_limit)
     config["callback"] = {"sb3_have.demo.DistanceLine": {"steps": steps}}
-    run = Run(
-        on_features(config, trained.encoder), ENV_ID, out, seed=seed, eval_freq=0, save_freq=0, time_limit=time_limit
-    )
+    run = Run(on_features(config), ENV_ID, out, seed=seed, eval_freq=0, save_freq=0, time_limit=time_limit)
     limits = f"{steps} steps or {time_limit / 60:g} minutes"
-    with phase(f"Training with its encoders for {limits} (press Ctrl-C once to stop earlier)"):
+    with phase(f"Training on the trained driver's encoders for {limits} (press Ctrl-C once to stop earlier)"):
         learned = run.train(steps, keep_checkpoint=False)
-        if not (out / "model.zip").exists():  # interrupted twice, or before the first step
-            raise KeyboardInterrupt
-        (out / "model.zip").unlink()
         assert isinstance(learned, HAVESAC)
-        model = with_encoders(learned, trained.encoder, config, make_training_env(ENV_ID, {**config, "n_envs": 1}))
-        model.save(out / "havesac_demo.zip")
+        env = make_training_env(ENV_ID, {**config, "n_envs": 1})
+        model = with_encoders(learned, config, env)
+        env.close()
+        write_atomically(out / "havesac_demo.zip", model.save)
+        (out / "model.zip").unlink()  # it reads features
         milliseconds = 1e3 * run.seconds / max(1, model.num_timesteps)
         print(f"{model.num_timesteps} steps in {run.seconds:.0f} s, {milliseconds:.0f} ms per step")
 
@@ -199,7 +210,7 @@ class DistanceLine(BaseCallback):
     Callback that shows the distance of the training episodes over the steps, as a line of small bars.
 
     The highest bar stands for the largest distance so far. In a terminal, the line is redrawn at the end of each
-    episode; elsewhere it is printed ten times during the training.
+    episode; elsewhere it is printed after each tenth of the steps.
 
     :param steps: Number of training steps
     """

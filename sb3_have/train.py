@@ -57,7 +57,7 @@ from sb3_have.configuration import (
 )
 from sb3_have.envs.weather import WEATHERS
 from sb3_have.evaluation.callback import WeatherEvalCallback
-from sb3_have.evaluation.episodes import leave_interrupts_to_parent
+from sb3_have.evaluation.episodes import close, leave_interrupts_to_parent
 
 VEC_ENVS: dict[str, type[DummyVecEnv] | type[SubprocVecEnv]] = {"dummy": DummyVecEnv, "subproc": SubprocVecEnv}
 """By the Zoo's names."""
@@ -173,7 +173,7 @@ class Run:
             try:
                 return self._train(checkpoint, env, steps, progress_bar, keep_checkpoint)
             finally:
-                env.close()
+                close(env)
 
     def _train(
         self, checkpoint: Path | None, env: VecEnv, steps: int, progress_bar: bool, keep_checkpoint: bool

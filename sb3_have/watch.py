@@ -181,7 +181,7 @@ def main(arguments: list[str] | None = None) -> None:
     parser.add_argument("--weather", help="weather of the episode; default: as in training")
     parser.add_argument("--seed", type=int, default=0, help="seed of the episode")
     parser.add_argument("--steps", type=int, help="largest number of steps; default: the whole episode")
-    parser.add_argument("--fps", type=float, help="frames per second; default: real time")
+    parser.add_argument("--fps", type=float, help="frames per second; default: real time, or 10 if it is unknown")
     parser.add_argument("--width", type=int, default=640, help="width of the film [px]; default: %(default)s")
     parser.add_argument("--algo", choices=list(ALGORITHMS), help="default: the one that saved the model")
     parser.add_argument(

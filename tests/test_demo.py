@@ -37,6 +37,10 @@ class Coaster(RandomDriver):
 COASTER = Coaster()
 
 
+def interrupt(*args: Any) -> Any:
+    raise KeyboardInterrupt
+
+
 @pytest.fixture(autouse=True)
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """The demo with a small environment and a small model."""
@@ -47,7 +51,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         "WEATHERS": ("slow", "fast"),
         "SHOWN": "fast",
         "SubprocVecEnv": DummyVecEnv,
-        "CHANGES": {"auxiliary": None},
+        "OVERRIDES": {"auxiliary": None},
     }
     functions = {"load_config": lambda *_: dict(config), "pretrained": lambda *_: COASTER}
     for name, value in {**constants, **functions}.items():
@@ -114,13 +118,32 @@ def test_an_interruption_keeps_what_is_there(
     assert HAVESAC.load(tmp_path / "havesac_demo.zip").num_timesteps == 20
 
 
+def test_an_interruption_after_the_training_does_not_stop_the_next_demo(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arguments = ["--steps", "20", "--episodes", "1", "--out", str(tmp_path)]
+    (tmp_path / "drive.gif").write_text("of an earlier demo")
+    with monkeypatch.context() as context, pytest.raises(SystemExit):
+        context.setattr(demo, "with_encoders", interrupt)
+        demo.main(arguments)
+    assert HAVESAC.load(tmp_path / "model.zip").num_timesteps == 20, "what was learned is still there"
+    assert not (tmp_path / "drive.gif").exists()
+    demo.main(arguments)
+    assert (tmp_path / "havesac_demo.zip").exists() and not (tmp_path / "model.zip").exists()
+
+
+def test_the_line_is_printed_after_each_tenth(capsys: pytest.CaptureFixture[str]) -> None:
+    line = demo.DistanceLine(steps=100)
+    line.locals = {"infos": []}
+    for line.num_timesteps in range(4, 101, 4):
+        line._on_step()
+    assert capsys.readouterr().out.count("step") == 10
+
+
 def test_the_demo_ends_when_interrupted_before_the_first_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def interrupted(self: FakeDrive, action: Any) -> Any:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(FakeDrive, "step", interrupted)
+    monkeypatch.setattr(FakeDrive, "step", interrupt)
     with pytest.raises(SystemExit) as stop:
         demo.main(["--steps", "20", "--out", str(tmp_path)])
     assert stop.value.code == 130 and "Interrupted" in capsys.readouterr().err

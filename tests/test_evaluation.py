@@ -21,6 +21,7 @@ from stable_baselines3.common.vec_env import (
 )
 
 from sb3_have.envs.drivers import KeepStraightDriver, RandomDriver
+from sb3_have.evaluation.episodes import close
 from sb3_have.evaluation.evaluation import evaluate, evaluate_episodes, format_table
 
 WEATHERS = ("slow", "fast")
@@ -258,3 +259,13 @@ def test_the_progress_bar_is_seen_within_that_of_a_training(monkeypatch: pytest.
         progress.add_task("training")
         evaluate(Watcher(), ENV_ID, ["slow"], n_episodes=2, progress_bar=True)
         assert "0/2 [" in terminal.getvalue()
+
+
+def test_environments_that_were_interrupted_in_a_step_are_closed() -> None:
+    env = SubprocVecEnv([lambda: gym.make(ENV_ID)] * 2)
+    stacked = VecFrameStack(env, 2)
+    stacked.reset()
+    stacked.step_async(np.zeros((2, 2), np.float32))
+    env.remotes[0].recv()  # the interruption came after the first answer
+    close(stacked)
+    assert env.closed and not any(process.is_alive() for process in env.processes)

@@ -102,6 +102,7 @@ def test_gif_loops_and_its_bars_are_the_weights(recording: Recording, tmp_path: 
     write_gif(recording, path, width=240)
     with Image.open(path) as gif:
         assert gif.n_frames == 8 and gif.info["loop"] == 0 and gif.width == 240  # type: ignore[attr-defined]
+        assert gif.info["duration"] == 1000 * (recording.seconds or 0.1)
         colour = np.array([int(modality_colours(["depth"])["depth"][i : i + 2], 16) for i in (1, 3, 5)])
         frames = Frames(recording, 240)
         top = 2 * 18 + frames.tile + 4 + 18  # the second bar, under a line of facts, the names and the images

@@ -106,7 +106,7 @@ def test_frames_of_a_film_are_not_kept_and_a_broken_one_leaves_no_file(
 def test_gif_has_every_step(tmp_path: Path) -> None:
     write_animation(a_recording(), tmp_path / "drive.gif", width=240)
     with Image.open(tmp_path / "drive.gif") as gif:
-        assert (gif.n_frames, gif.width, gif.info["duration"]) == (T, 240, 100)  # type: ignore[attr-defined]
+        assert (gif.n_frames, gif.width, gif.info["duration"]) == (T, 240, 200)  # type: ignore[attr-defined]
     write_animation(a_recording(), tmp_path / "fast.gif", fps=125, width=240)
     with Image.open(tmp_path / "fast.gif") as gif:
         assert gif.info["duration"] == 20  # less is shown slowly
@@ -236,6 +236,7 @@ def test_what_cannot_be_watched(run: Path, tmp_path: Path, capsys: pytest.Captur
         [str(run), *out, "--env", watch.ENV_ID, "--config", "nothing"], capsys
     )
     assert "needs neither --algo nor --config" in refused(["have", *out, "--algo", "sac"], capsys)
+    assert "needs neither --algo nor --config" in refused(["have", *out, "--config", "lve"], capsys)
     assert not list(tmp_path.glob("a.*"))
 
 

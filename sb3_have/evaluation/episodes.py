@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import SubprocVecEnv, VecEnv
 
 Env = gym.Env[Any, Any]
 
@@ -91,6 +91,23 @@ def leave_interrupts_to_parent() -> None:
     """Ignore Ctrl-C in a worker process: the terminal sends it to all processes, and the parent stops its workers."""
     if multiprocessing.parent_process() is not None:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def close(vec_env: VecEnv) -> None:
+    """
+    Close environments, also if an exception interrupted one of their steps.
+
+    ``SubprocVecEnv.close`` would then wait for ever for the workers whose answer has been read, so they are terminated.
+
+    :param vec_env: The environments
+    """
+    workers = vec_env.unwrapped
+    if isinstance(workers, SubprocVecEnv) and workers.waiting:
+        for process in workers.processes:
+            process.terminate()
+            process.join()
+        workers.closed = True
+    vec_env.close()
 
 
 class Step(NamedTuple):

@@ -15,7 +15,7 @@ import pandas as pd
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv
 from tqdm import tqdm
 
-from sb3_have.evaluation.episodes import Env, EpisodeQueue, Predictor, Step, Task, drive
+from sb3_have.evaluation.episodes import Env, EpisodeQueue, Predictor, Step, Task, close, drive
 from sb3_have.evaluation.wrapping import wrap_as_trained
 
 
@@ -147,7 +147,7 @@ def drive_tasks(
                     outcomes[step.numbers[i]] = _outcome(step, i)
                     bar.update()
     finally:
-        vec_env.close()
+        close(vec_env)
     return pd.DataFrame([{"weather": task.weather, "seed": task.seed, **outcomes[i]} for i, task in numbered])
 
 
@@ -214,8 +214,8 @@ def format_table(results: Mapping[str, pd.DataFrame]) -> str:
     Format evaluations side by side, as in the paper's Table 1: episode reward (ER) and distance (D) by weather.
 
     :param results: From :func:`evaluate`, by driver; all over the same weathers
-    :return: A Markdown table of mean ± standard deviation, or of the value of a single episode; the last rows are over
-        all episodes
+    :return: A Markdown table of mean ± standard deviation, or just the value where there is one episode; the last rows
+        are over all episodes
     :raises ValueError: If the weathers differ
     """
     weathers = [list(frame["weather"]) for frame in results.values()]
@@ -227,8 +227,9 @@ def format_table(results: Mapping[str, pd.DataFrame]) -> str:
             cells = []
             for frame in results.values():
                 mean, std = frame.loc[i, [f"{name}_mean", f"{name}_std"]] if weather != "all" else pooled(frame, name)
-                n_episodes = frame["episodes"].sum() if weather == "all" else frame.loc[i, "episodes"]
-                cells.append(f"{mean:.{digits}f}" + (f" ± {std:.{digits}f}" if n_episodes > 1 else ""))
+                counts = frame["episodes"].to_numpy(int)
+                single = (counts.sum() if weather == "all" else counts[i]) == 1
+                cells.append(f"{mean:.{digits}f}" if single else f"{mean:.{digits}f} ± {std:.{digits}f}")
             rows.append([weather if label == "ER" else "", label, *cells])
     return markdown_table(["weather", "", *results], rows)
 

@@ -187,7 +187,7 @@ def write_gif(recording: Recording, path: Path | str, width: int = 480, max_byte
     """
     Write an episode as a small looped GIF, leaving out steps if it is long.
 
-    The frames follow each other as fast as the steps of the environment, but at most 10 in a second.
+    It runs in real time, but at most at 10 frames per second.
 
     :param recording: Episode to show
     :param path: Name of the file
@@ -196,9 +196,9 @@ def write_gif(recording: Recording, path: Path | str, width: int = 480, max_byte
     """
     frames = Frames(recording, width)
     stride = -(-len(frames) // MAX_FRAMES)
-    fps = min(GIF_FPS, 1.0 / recording.seconds) if recording.seconds else GIF_FPS
     while True:
         shown = range(0, len(frames), stride)
+        fps = min(GIF_FPS, 1.0 / (stride * recording.seconds)) if recording.seconds else GIF_FPS
         _write_gif(Path(path), (frames[step] for step in shown), fps)
         if Path(path).stat().st_size <= max_bytes or len(shown) == 1:
             return

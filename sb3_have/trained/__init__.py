@@ -2,7 +2,8 @@
 Trained drivers that come with the package.
 
 Each has two files in this folder: ``<name>.safetensors``, the networks that act, in float16, and ``<name>.json``, which
-describes the policy, its training and its distance in each weather. Nothing is unpickled.
+describes the policy, its training and its distance in each weather. Nothing is unpickled. A new agent can learn on the
+features of a driver's encoders, see :mod:`sb3_have.trained.features`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,8 @@
-"""Train with the frozen encoders of a trained driver: on their features instead of images, which is fast."""
+"""Training with the frozen encoders of a trained driver: on their features instead of images, which is fast."""
 
 from __future__ import annotations
 
+import multiprocessing
 from collections.abc import Mapping
 from typing import Any
 
@@ -10,9 +11,7 @@ import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecEnv
-from torch import nn
 
-from sb3_have.common.encoders import MultiModalEncoder
 from sb3_have.configuration import model_kwargs
 from sb3_have.have.have import HAVESAC
 from sb3_have.trained import pretrained
@@ -20,7 +19,7 @@ from sb3_have.trained import pretrained
 
 class EncodedImages(gym.ObservationWrapper[Any, Any, Any]):
     """
-    Replace the images of ``HighwayVision-v0`` by the features that a trained driver's encoders compute from them.
+    Replace the images of ``HighwayVision-v0`` with the features that a trained driver's encoders compute from them.
 
     The wrapper stacks the frames itself, as ``VecFrameStack`` does: frames before the first one are 0.
 
@@ -30,9 +29,10 @@ class EncodedImages(gym.ObservationWrapper[Any, Any, Any]):
 
     def __init__(self, env: gym.Env[Any, Any], name: str = "have") -> None:
         super().__init__(env)
+        if multiprocessing.parent_process() is not None:
+            # Environments in processes of their own would compete for the cores
+            th.set_num_threads(1)
         self.encoder = pretrained(name, "cpu").encoder
-        # Every environment has a core
-        th.set_num_threads(1)
         features = spaces.Box(-np.inf, np.inf, (self.encoder.features_dim,), np.float32)
         self.observation_space = spaces.Dict(dict.fromkeys(self.encoder.modalities, features))
 
@@ -51,46 +51,45 @@ class EncodedImages(gym.ObservationWrapper[Any, Any, Any]):
         return dict(zip(self.encoder.modalities, features.numpy(), strict=True))
 
 
-class NoEncoder(nn.Module):
+def on_features(config: Mapping[str, Any], name: str = "have") -> dict[str, Any]:
     """
-    Stands for an encoder where the observations are features already.
+    Return a configuration that trains on the features of a driver's encoders.
 
-    :param observation_space: Box of shape (features_dim,)
-    :param features_dim: Number of features
+    :param config: Configuration that trains on the images that the driver was trained on
+    :param name: Name of the driver
     """
+    wrappers = config.get("env_wrapper") or []
+    wrappers = wrappers if isinstance(wrappers, list) else [wrappers]
+    encoder = pretrained(name, "cpu").encoder
+    policy_kwargs = {
+        **config.get("policy_kwargs", {}),
+        "features_dim": encoder.features_dim,
+        "encoder_classes": dict.fromkeys(encoder.modalities, "torch.nn.Identity"),
+    }
+    return {
+        **config,
+        "frame_stack": 1,
+        "env_wrapper": [*wrappers, {f"{__name__}.EncodedImages": {"name": name}}],
+        "policy_kwargs": policy_kwargs,
+    }
 
-    def __init__(self, observation_space: spaces.Box, features_dim: int) -> None:
-        super().__init__()
 
-    def forward(self, features: th.Tensor) -> th.Tensor:
-        return features
-
-
-def on_features(config: Mapping[str, Any], encoder: MultiModalEncoder) -> dict[str, Any]:
+def with_encoders(model: HAVESAC, config: Mapping[str, Any], env: VecEnv, name: str = "have") -> HAVESAC:
     """
-    Return a configuration that trains on the features of frozen encoders.
+    Return a model that reads images: a driver's encoders, and behind them the networks that learned on their features.
 
-    :param config: Configuration that trains on images
-    :param encoder: Encoders of the driver "have"
-    """
-    policy_kwargs = {**config.get("policy_kwargs", {}), "encoder_classes": dict.fromkeys(encoder.modalities, NoEncoder)}
-    wrapper = f"{EncodedImages.__module__}.{EncodedImages.__name__}"
-    return {**config, "frame_stack": None, "env_wrapper": wrapper, "policy_kwargs": policy_kwargs}
+    Its optimizers and its entropy coefficient start anew, and its replay memory is empty. Where its encoders compute in
+    bfloat16, features differ a little from those of the training, which are float32.
 
-
-def with_encoders(model: HAVESAC, encoder: MultiModalEncoder, config: Mapping[str, Any], env: VecEnv) -> HAVESAC:
-    """
-    Return a model that reads images: the encoders, and behind them the networks that learned on their features.
-
-    :param model: A model trained as :func:`on_features` says
-    :param encoder: Encoders of the driver "have"
-    :param config: Configuration that trains on images
+    :param model: Model that was trained with the configuration from :func:`on_features`
+    :param config: The configuration that was given to :func:`on_features`
     :param env: Environment with images
+    :param name: Name of the driver
     """
     joined = HAVESAC(env=env, seed=model.seed, device=model.device, **model_kwargs(config, env))
     state = model.policy.state_dict()
-    for critic in ("critic", "critic_target"):
-        state |= {f"{critic}.encoder.{name}": tensor for name, tensor in encoder.state_dict().items()}
+    for key, tensor in pretrained(name, "cpu").encoder.state_dict().items():
+        state |= {f"{critic}.encoder.{key}": tensor for critic in ("critic", "critic_target")}
     joined.policy.load_state_dict(state)
     joined.num_timesteps = model.num_timesteps
     return joined
