@@ -52,6 +52,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         "SHOWN": "fast",
         "SubprocVecEnv": DummyVecEnv,
         "OVERRIDES": {"auxiliary": None},
+        "TRAFFIC": {},
     }
     functions = {"load_config": lambda *_: dict(config), "pretrained": lambda *_: COASTER}
     for name, value in {**constants, **functions}.items():
