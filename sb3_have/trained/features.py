@@ -78,8 +78,8 @@ def with_encoders(model: HAVESAC, config: Mapping[str, Any], env: VecEnv, name: 
     """
     Return a model that reads images: a driver's encoders, and behind them the networks that learned on their features.
 
-    Its optimizers and its entropy coefficient start anew, and its replay memory is empty. Where its encoders compute in
-    bfloat16, features differ a little from those of the training, which are float32.
+    Its optimizers and entropy coefficient are reset, and its replay buffer is empty. Where its encoders compute in
+    bfloat16, the features differ a little from those of the training, which are float32.
 
     :param model: Model that was trained with the configuration from :func:`on_features`
     :param config: The configuration that was given to :func:`on_features`
