@@ -78,8 +78,8 @@ def with_encoders(model: HAVESAC, config: Mapping[str, Any], env: VecEnv, name: 
     """
     Return a model that reads images: a driver's encoders, and behind them the networks that learned on their features.
 
-    Its optimizers and entropy coefficient are reset, and its replay buffer is empty. Where its encoders compute in
-    bfloat16, the features differ a little from those of the training, which are float32.
+    Its optimizers and entropy coefficient are reset, and its replay buffer is empty. In the training, the
+    features are computed on the CPU. On a GPU, whose encoders may compute in bfloat16, they differ a little.
 
     :param model: Model that was trained with the configuration from :func:`on_features`
     :param config: The configuration that was given to :func:`on_features`
