@@ -148,6 +148,9 @@ def test_neighbours_are_those_of_the_stock_road(scenario: str) -> None:
     for seed in range(3):
         env.reset(seed=seed)
         road = env.road
+        # Three vehicles at the same place
+        for k in (3, 7):
+            road.vehicles[k].position[:] = road.vehicles[5].position
         road._placed = road._places()
         road._on_lane = {}
         for vehicle in road.vehicles:

@@ -85,7 +85,7 @@ class Driver(IDMVehicle):
             # Its sign does not matter, because it is squared
             distance = float(front_vehicle.position[0] - ego_vehicle.position[0])
             gap_ratio = self.desired_gap(ego_vehicle, front_vehicle) / not_zero(distance)
-            acceleration -= self.COMFORT_ACC_MAX * float(np.power(gap_ratio, 2))
+            acceleration -= self.COMFORT_ACC_MAX * float(np.power(gap_ratio, 2.0))
         return float(acceleration)
 
     def desired_gap(self, ego_vehicle: Vehicle, front_vehicle: Vehicle | None = None, projected: bool = True) -> float:
@@ -114,4 +114,4 @@ class ScenarioDriver(NeverReverses, Driver):
 
 
 def _clip(value: float, low: float, high: float) -> float:
-    return min(max(value, low), high)
+    return low if value < low else high if value > high else value

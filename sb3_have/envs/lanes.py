@@ -39,8 +39,8 @@ class BentLane(AxisLane):
         return np.array([x, self._y(x) + self.sign * lateral])
 
     def local_coordinates(self, position: np.ndarray) -> tuple[float, float]:
-        x = float(position[0])
-        return self._mirrored(x), self.sign * (float(position[1]) - self._y(x))
+        x, y = position.tolist()
+        return self._mirrored(x), self.sign * (y - self._y(x))
 
     def heading_at(self, longitudinal: float) -> float:
         along = math.atan(self._slope(self._mirrored(longitudinal)))
@@ -116,7 +116,7 @@ class ShapedNetwork(RoadNetwork):
 
     def get_closest_lane_index(self, position: np.ndarray, heading: float | None = None) -> LaneIndex:
         # Ignore the heading: a vehicle on the wrong side of the road is in an oncoming lane
-        shape, x, y = self.shape, float(position[0]), float(position[1])
+        shape, (x, y) = self.shape, position.tolist()
         across = y - shape.bend(x)
         number = min(max(round(across / shape.lane_width), 0), shape.lanes_count - 1)
         if self.ramp is not None and across > shape.right_edge and shape.has_ramp(x):

@@ -9,9 +9,11 @@ that are not straight.
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import math
 from collections.abc import Sequence
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
@@ -43,7 +45,8 @@ class AxisLane(StraightLane):
         self.beginning, self.centre = float(start[0]), float(start[1])
 
     def local_coordinates(self, position: np.ndarray) -> tuple[float, float]:
-        return float(position[0]) - self.beginning, float(position[1]) - self.centre
+        x, y = position.tolist()
+        return x - self.beginning, y - self.centre
 
     def heading_at(self, longitudinal: float) -> float:
         return 0.0
@@ -75,7 +78,7 @@ class HighwayNetwork(RoadNetwork):
         return 0.0
 
     def get_closest_lane_index(self, position: np.ndarray, heading: float | None = None) -> LaneIndex:
-        x, y = float(position[0]), float(position[1])
+        x, y = position.tolist()
         beyond = max(x - ROAD_LENGTH, 0) + max(0 - x, 0)
         angle = 0.0 if heading is None else abs((heading + math.pi) % (2 * math.pi) - math.pi)
         distances = [abs(y - k * LANE_WIDTH) + beyond + angle for k in range(len(self.graph["0"]["1"]))]
@@ -86,7 +89,7 @@ class HighwayRoad(Road):
     """A :class:`~highway_env.road.road.Road` along x with fast look-ups of neighbours and collisions."""
 
     _placed: list[Placed] | None = None
-    _on_lane: dict[LaneIndex, list[tuple[float, Vehicle]]]
+    _on_lane: dict[LaneIndex, tuple[list[float], list[Vehicle]]]
     _motions: dict[Vehicle, tuple[np.ndarray, np.ndarray]]
 
     def act(self) -> None:
@@ -100,8 +103,9 @@ class HighwayRoad(Road):
             self._on_lane, self._motions = {}, {}
 
     def _places(self) -> list[Placed]:
-        bend, places = self.network.bend, [v.position.tolist() for v in self.vehicles]
-        return [(x, y, bend(x), v) for (x, y), v in zip(places, self.vehicles, strict=True)]
+        # Of two vehicles at the same x, highway-env finds the later one in front and the earlier one behind
+        bend, vehicles = self.network.bend, self.vehicles[::-1]
+        return [(x, y, bend(x), v) for (x, y), v in zip([v.position.tolist() for v in vehicles], vehicles, strict=True)]
 
     def neighbour_vehicles(
         self, vehicle: Vehicle, lane_index: LaneIndex | None = None
@@ -111,18 +115,14 @@ class HighwayRoad(Road):
         lane_index = lane_index or vehicle.lane_index
         lane = self.network.get_lane(lane_index)
         if lane_index not in self._on_lane:
-            self._on_lane[lane_index] = lane.occupants(self._placed)
-        x = lane.sign * float(vehicle.position[0])
-        x_front, x_rear = math.inf, -math.inf
-        front = rear = None
-        for x_other, other in self._on_lane[lane_index]:
-            if other is vehicle:
-                continue
-            if x <= x_other <= x_front:
-                x_front, front = x_other, other
-            elif x_rear < x_other < x:
-                x_rear, rear = x_other, other
-        return front, rear
+            occupants = sorted(lane.occupants(self._placed), key=itemgetter(0))
+            self._on_lane[lane_index] = [x for x, _ in occupants], [other for _, other in occupants]
+        positions, others = self._on_lane[lane_index]
+        i = bisect.bisect_left(positions, lane.sign * float(vehicle.position[0]))
+        rear = others[i - 1] if i > 0 else None
+        if i < len(others) and others[i] is vehicle:
+            i += 1
+        return others[i] if i < len(others) else None, rear
 
     def motion(self, vehicle: Vehicle) -> tuple[np.ndarray, np.ndarray]:
         """Direction (a unit vector) and velocity [m/s] of a vehicle."""

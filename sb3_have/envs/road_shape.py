@@ -74,11 +74,12 @@ class RoadShape:
 
     def bend(self, x: Any) -> Any:
         """Offset of the road to the right of the x axis [m] at x [m]."""
-        return self.swing * _sin(_WAVE * x)
+        return self.swing * (math.sin(_WAVE * x) if isinstance(x, float) else np.sin(_WAVE * x))
 
     def slope(self, x: Any) -> Any:
         """Return the derivative of :meth:`bend`, the tangent of the heading of the road at x [m]."""
-        return self.swing * 2 * math.pi / PERIOD * _sin(_WAVE * x + 0.5 * math.pi)
+        phase = _WAVE * x + 0.5 * math.pi
+        return self.swing * 2 * math.pi / PERIOD * (math.sin(phase) if isinstance(x, float) else np.sin(phase))
 
     def direction(self, x: float) -> tuple[float, float]:
         """Return the unit vector along the road at x [m]."""
@@ -131,10 +132,6 @@ def road_shape(scenario: str, lanes_count: int, lane_width: float = 4.0) -> Road
             )
         return RoadShape(lanes_count, lane_width, swing=SWING, oncoming=lanes_count // 2)
     return RoadShape(lanes_count, lane_width, ramps=scenario == "merge")
-
-
-def _sin(x: Any) -> Any:
-    return math.sin(x) if isinstance(x, float) else np.sin(x)
 
 
 def _positive(x: Any) -> Any:
