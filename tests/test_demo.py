@@ -1,6 +1,7 @@
 """The demo from end to end, in a small stand-in for the highway."""
 
 import pickle
+import signal
 import time
 from pathlib import Path
 from typing import Any, ClassVar
@@ -131,6 +132,32 @@ def test_an_interruption_after_the_training_does_not_stop_the_next_demo(
     assert not (tmp_path / "drive.gif").exists()
     demo.main(arguments)
     assert (tmp_path / "havesac_demo.zip").exists() and not (tmp_path / "model.zip").exists()
+
+
+@pytest.mark.parametrize("second", ["training", "saving"])
+def test_a_second_interruption_keeps_what_was_learned(
+    second: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on_step, save = demo.DistanceLine._on_step, HAVESAC.save
+
+    def interrupted_step(line: demo.DistanceLine) -> bool:
+        if line.num_timesteps == 10:
+            for _ in range(2 if second == "training" else 1):
+                signal.raise_signal(signal.SIGINT)
+        return on_step(line)
+
+    def interrupted_save(model: HAVESAC, *args: Any, **kwargs: Any) -> None:
+        monkeypatch.setattr(HAVESAC, "save", save)
+        signal.raise_signal(signal.SIGINT)
+        save(model, *args, **kwargs)
+
+    monkeypatch.setattr(demo.DistanceLine, "_on_step", interrupted_step)
+    monkeypatch.setattr(HAVESAC, "save", interrupted_save)
+    with pytest.raises(SystemExit) as stop:
+        demo.main(["--steps", "20", "--out", str(tmp_path)])
+    assert stop.value.code == 130
+    assert HAVESAC.load(tmp_path / "model.zip").num_timesteps == 10
+    assert not (tmp_path / "havesac_demo.zip").exists(), "the second interruption takes effect"
 
 
 def test_the_line_is_printed_after_each_tenth(capsys: pytest.CaptureFixture[str]) -> None:
