@@ -40,6 +40,7 @@ from sb3_have.checkpoint import (
     newest_checkpoint,
 )
 from sb3_have.checkpoint.files import locked, write_atomically
+from sb3_have.checkpoint.stopping import delay_signals
 from sb3_have.common.buffers import ModalityReplayBuffer, stacked_frames
 from sb3_have.common.memory import keep_freed_memory
 from sb3_have.configuration import (
@@ -160,7 +161,8 @@ class Run:
 
         :param steps: Training steps over all sessions
         :param progress_bar: Whether to show SB3's progress bar, and one for each evaluation
-        :param keep_checkpoint: Whether to save checkpoints, with which the run can be resumed
+        :param keep_checkpoint: Whether to save checkpoints, with which the run can be resumed. Without them,
+            ``model.zip`` is also saved if a second Ctrl-C interrupts the training
         :return: The model, which is also saved as ``model.zip``
         :raises BlockingIOError: If another process works in the folder
         :raises ValueError: If the folder is of another run, or of one that cannot be resumed
@@ -203,15 +205,26 @@ class Run:
                     reset_num_timesteps=checkpoint is None,
                     progress_bar=progress_bar,
                 )
+        except KeyboardInterrupt:
+            # A second signal. Without checkpoints, only this keeps what was learned
+            if not keep_checkpoint:
+                self._save(model)
+            raise
+        else:
+            self._save(model)
         finally:
             self.seconds += time.monotonic() - self._started
             logger.close()
             saving.release()
         self.interrupted = stop.interrupted
-        write_atomically(self.out / "model.zip", model.save)
-        if (normalizer := model.get_vec_normalize_env()) is not None:
-            write_atomically(self.out / "vecnormalize.pkl", normalizer.save)  # type: ignore[arg-type]
         return model
+
+    def _save(self, model: OffPolicyAlgorithm) -> None:
+        """Save the model, even if a signal arrives in the meantime."""
+        with delay_signals():
+            write_atomically(self.out / "model.zip", model.save)
+            if (normalizer := model.get_vec_normalize_env()) is not None:
+                write_atomically(self.out / "vecnormalize.pkl", normalizer.save)  # type: ignore[arg-type]
 
     def _checkpoint_to_resume(self) -> Path | None:
         """Find the newest checkpoint of this run, and drop what was recorded after it: that is repeated."""

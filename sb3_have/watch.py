@@ -4,10 +4,11 @@ Film a trained model: an episode with the sensors' images, the modality weights,
     python -m sb3_have.watch runs/have-0 --weather HardRainNight --out drive.mp4
 
 MODEL is a zip that SB3 saved, a checkpoint, the folder of a run of ``python -m sb3_have.train``, or the name of a
-trained driver that comes with the package: ``have`` or ``have-depth``. The settings of a run include its environment.
-Without them it is HighwayVision-v0 as in ``--config``, with the modalities and the image size of the model, unless
-``--env`` and ``--env-kwargs`` name another one. The statistics of ``VecNormalize`` are read from the checkpoint, or
-from ``vecnormalize.pkl`` beside the model or where the Zoo saves it; the zip does not show whether they are needed.
+trained driver that comes with the package: ``have`` or ``have-depth``. Your own model or run of the same name takes
+precedence, and ``./have`` never means the trained driver. The settings of a run include its environment. Without them
+it is HighwayVision-v0 as in ``--config``, with the modalities and the image size of the model, unless ``--env`` and
+``--env-kwargs`` name another one. The statistics of ``VecNormalize`` are read from the checkpoint, or from
+``vecnormalize.pkl`` beside the model or where the Zoo saves it; the zip does not show whether they are needed.
 """
 
 from __future__ import annotations
@@ -44,12 +45,13 @@ CAMERAS = (ENV_ID, "CarlaVision-v0")
 ACTIONS = ("throttle (negative brakes)", "steering (positive turns right)")
 
 
-def model_file(path: Path) -> Path:
+def model_file(name: str | Path) -> Path:
     """
     Find the file of a model.
 
-    :param path: A model, with or without the ending zip, a checkpoint, or a folder with ``model.zip`` or checkpoints
+    :param name: A model, with or without the ending zip, a checkpoint, or a folder with ``model.zip`` or checkpoints
     """
+    path = Path(name)
     if path.is_dir():
         candidates = [path / "model.zip", *reversed(checkpoints(path))]
     else:
@@ -58,8 +60,8 @@ def model_file(path: Path) -> Path:
         if candidate.is_file():
             return candidate
     raise FileNotFoundError(
-        f"{path} is neither a model, nor a folder with model.zip or checkpoints, nor a trained driver"
-        + suggest(str(path), driver_names())
+        f"{name} is neither a model, nor a folder with model.zip or checkpoints, nor a trained driver"
+        + suggest(str(name), driver_names())
     )
 
 
@@ -164,9 +166,10 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument(
         "model",
-        type=Path,
         metavar="MODEL",
-        help=f"zip of a model, checkpoint, folder of a training run, or a trained driver: {', '.join(driver_names())}",
+        help="zip of a model, checkpoint, folder of a training run, or a trained driver: "
+        f"{', '.join(driver_names())}. Your own model or run of the same name takes precedence; ./have never means the "
+        "trained driver.",
     )
     parser.add_argument("--out", type=Path, default=Path("drive.mp4"), help=".mp4, .gif or .html; default: %(default)s")
     parser.add_argument("--env", help=f"environment id; default: that of the run, or {ENV_ID}")
@@ -218,19 +221,28 @@ def watch(args: argparse.Namespace) -> Recording:
     model: Predictor
     config: Mapping[str, Any] = {}
     statistics = args.vecnormalize
-    if str(args.model) in driver_names() and not args.model.exists():
+    # A folder without a model must not hide a trained driver. "./have" and "have/" are not names of drivers
+    file = None
+    try:
+        file = model_file(args.model)
+    except FileNotFoundError:
+        if args.model not in driver_names():
+            raise
+    if file is None:
         if args.algo or args.config:
             raise ValueError(f"{args.model} is a trained driver, which needs neither --algo nor --config")
-        model = pretrained(str(args.model), args.device)
+        model = pretrained(args.model, args.device)
         env_id, env_kwargs = args.env or model.card["env_id"], model.env_kwargs
     else:
-        file = model_file(args.model)
         model, settings = load_model(file, args.algo, args.device)
         env_id, env_kwargs, config = environment(model, settings, args.env, args.config or "have")
         statistics = statistics or statistics_file(file, env_id)
     env_kwargs |= dict(args.env_kwargs) | ({} if args.weather is None else {"weather": args.weather})
     normalizer = None if statistics is None else saved_normalizer(statistics)
-    print(f"{env_id} {env_kwargs}" + ("" if normalizer is None else f", observations normalized as in {statistics}"))
+    print(
+        f"{file or f'trained driver {args.model}'} in {env_id} {env_kwargs}"
+        + ("" if normalizer is None else f", observations normalized as in {statistics}")
+    )
     recording = record_episode(
         model,
         env_id,

@@ -1,6 +1,8 @@
-"""The demo from end to end, in a small stand-in for the highway."""
+"""The demo: as a user runs it, with short episodes, and its interruptions in a small stand-in for the highway."""
 
+import multiprocessing
 import pickle
+import signal
 import time
 from pathlib import Path
 from typing import Any, ClassVar
@@ -41,7 +43,7 @@ def interrupt(*args: Any) -> Any:
     raise KeyboardInterrupt
 
 
-@pytest.fixture(autouse=True)
+@pytest.fixture
 def small(monkeypatch: pytest.MonkeyPatch) -> None:
     """The demo with a small environment and a small model."""
     config = {**CONFIG, "learning_rate": 1e-3, "policy_kwargs": {"features_dim": 4, "net_arch": [8]}}
@@ -60,23 +62,44 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(features, "pretrained", lambda *_: COASTER)
 
 
-def test_the_demo_writes_all_of_its_results_and_can_be_repeated(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_the_whole_demo_with_environments_in_processes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    for steps in (20, 30):  # the second run finds the results of the first in its folder
-        demo.main(["--steps", str(steps), "--episodes", "1", "--out", str(tmp_path)])
-        model = HAVESAC.load(tmp_path / "havesac_demo.zip")
-        assert model.num_timesteps == steps
-    table = pd.read_csv(tmp_path / "evaluation.csv")
-    drivers = ["this HAVESAC", "trained HAVESAC", "random", "straight at 20 m/s", "IDM/MOBIL"]
-    assert list(table["driver"].unique()) == drivers
-    assert list(table["weather"]) == ["slow", "fast"] * len(drivers)
-    printed = capsys.readouterr().out
-    assert "ER" in printed and printed.count("(mean of last") > 10
+    multiprocessing.get_context("forkserver").set_forkserver_preload(["sb3_have.demo"])
+    weathers = ["ClearNoon", "HardRainNight"]
+    monkeypatch.setattr(demo, "WEATHERS", weathers)
+    monkeypatch.setattr(demo, "SHOWN_STEPS", 5)
+    monkeypatch.setattr(demo, "OVERRIDES", {**demo.OVERRIDES, "n_envs": 2, "learning_starts": 20})
+    monkeypatch.setattr(demo, "TRAFFIC", {**demo.TRAFFIC, "duration": 3.0})
+    before = multiprocessing.active_children()
+    demo.main(["--steps", "40", "--episodes", "1", "--out", str(tmp_path)])
+    assert set(multiprocessing.active_children()) <= set(before)
+
+    # Files
+    written = {path.name for path in tmp_path.iterdir()}
+    assert written >= {*demo.RESULTS, "trained.gif", "trained.html", "0.monitor.csv", "1.monitor.csv"} - {"model.zip"}
+    assert "model.zip" not in written
     for name in ("trained.gif", "learning_curve.png", "modality_weights.png", "drive.gif"):
         with Image.open(tmp_path / name) as picture:
             assert picture.width > 100
-    assert (tmp_path / "trained.html").exists() and (tmp_path / "drive.html").exists()
+    model = HAVESAC.load(tmp_path / "havesac_demo.zip")
+    assert model.num_timesteps == 40
+    assert model.observation_space["rgb"].shape == (9, 64, 64), "it reads images"  # type: ignore[index]
+
+    # Rows of the table, in the file and as printed
+    rows = pd.read_csv(tmp_path / "evaluation.csv")
+    drivers = ["this HAVESAC", "trained HAVESAC", "random", "straight at 20 m/s", "IDM/MOBIL"]
+    assert list(zip(rows["driver"], rows["weather"], strict=True)) == [(d, w) for d in drivers for w in weathers]
+    assert (rows["episodes"] == 1).all() and rows["steps_mean"].between(1, 15).all()
+    means = rows.groupby("driver")["distance_mean"].mean()
+    assert (means[["trained HAVESAC", "straight at 20 m/s", "IDM/MOBIL"]] > 1.5 * means["random"]).all()
+    printed = capsys.readouterr().out
+    lines = [line.split("|")[1:-1] for line in printed.splitlines() if line.startswith("|")]
+    head, _, *table = [[cell.strip() for cell in line] for line in lines]
+    assert head == ["weather", "", *drivers]
+    names = [name for weather in [*weathers, "all"] for name in (weather, "")]
+    assert [line[:2] for line in table] == [[name, "ER" if name else "D [m]"] for name in names]
+    assert printed.count("\nstep ") == 10
 
 
 def test_the_learning_rate_decays_over_steps_or_time(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,6 +123,7 @@ def test_the_line_of_distances() -> None:
     assert line.line().endswith("   10 m (mean of last 10)") and len(line.line()) < 80
 
 
+@pytest.mark.usefixtures("small")
 def test_an_interruption_keeps_what_is_there(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -119,18 +143,47 @@ def test_an_interruption_keeps_what_is_there(
     assert HAVESAC.load(tmp_path / "havesac_demo.zip").num_timesteps == 20
 
 
+@pytest.mark.usefixtures("small")
 def test_an_interruption_after_the_training_does_not_stop_the_next_demo(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     arguments = ["--steps", "20", "--episodes", "1", "--out", str(tmp_path)]
-    (tmp_path / "drive.gif").write_text("of an earlier demo")
+    for name in demo.RESULTS:
+        (tmp_path / name).write_text("of an earlier demo")
     with monkeypatch.context() as context, pytest.raises(SystemExit):
         context.setattr(demo, "with_encoders", interrupt)
         demo.main(arguments)
     assert HAVESAC.load(tmp_path / "model.zip").num_timesteps == 20, "what was learned is still there"
-    assert not (tmp_path / "drive.gif").exists()
+    assert [name for name in demo.RESULTS if (tmp_path / name).exists()] == ["model.zip"]
     demo.main(arguments)
-    assert (tmp_path / "havesac_demo.zip").exists() and not (tmp_path / "model.zip").exists()
+    assert [name for name in demo.RESULTS if not (tmp_path / name).exists()] == ["model.zip"]
+
+
+@pytest.mark.usefixtures("small")
+@pytest.mark.parametrize("second", ["training", "saving"])
+def test_a_second_interruption_keeps_what_was_learned(
+    second: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    on_step, save = demo.DistanceLine._on_step, HAVESAC.save
+
+    def interrupted_step(line: demo.DistanceLine) -> bool:
+        if line.num_timesteps == 10:
+            for _ in range(2 if second == "training" else 1):
+                signal.raise_signal(signal.SIGINT)
+        return on_step(line)
+
+    def interrupted_save(model: HAVESAC, *args: Any, **kwargs: Any) -> None:
+        monkeypatch.setattr(HAVESAC, "save", save)
+        signal.raise_signal(signal.SIGINT)
+        save(model, *args, **kwargs)
+
+    monkeypatch.setattr(demo.DistanceLine, "_on_step", interrupted_step)
+    monkeypatch.setattr(HAVESAC, "save", interrupted_save)
+    with pytest.raises(SystemExit) as stop:
+        demo.main(["--steps", "20", "--out", str(tmp_path)])
+    assert stop.value.code == 130
+    assert HAVESAC.load(tmp_path / "model.zip").num_timesteps == 10
+    assert not (tmp_path / "havesac_demo.zip").exists(), "the second interruption takes effect"
 
 
 def test_the_line_is_printed_after_each_tenth(capsys: pytest.CaptureFixture[str]) -> None:
@@ -141,6 +194,7 @@ def test_the_line_is_printed_after_each_tenth(capsys: pytest.CaptureFixture[str]
     assert capsys.readouterr().out.count("step") == 10
 
 
+@pytest.mark.usefixtures("small")
 def test_the_demo_ends_when_interrupted_before_the_first_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

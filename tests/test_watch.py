@@ -1,6 +1,7 @@
 """Films: a frame for each step, readable again; and which model, environment and statistics are used."""
 
 import builtins
+import shutil
 import weakref
 from collections.abc import Iterator
 from pathlib import Path
@@ -259,6 +260,28 @@ def test_a_checkpoint_and_the_model_beside_it_are_of_the_same_run(run: Path, tmp
     assert watch.model_file(running) == running / "checkpoint-20"
     with pytest.raises(FileNotFoundError, match=r"model\.zip or checkpoints"):
         watch.model_file(tmp_path)
+
+
+def test_only_a_model_takes_precedence_over_a_trained_driver(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(watch, "write_animation", lambda *args, **kwargs: None)
+
+    def watched(name: str) -> str:
+        watch.main([name, "--steps", "2"])
+        return capsys.readouterr().out
+
+    (tmp_path / "have").mkdir()
+    assert f"trained driver have in {watch.ENV_ID}" in watched("have")
+    for path in ("./have", "have/"):
+        assert f"{path} is neither a model, nor a folder" in refused([path], capsys)
+    shutil.copy(run / "checkpoint-20", tmp_path / "have")
+    for path in ("have", "./have", "have/"):
+        assert f"have/checkpoint-20 in {ENV_ID}" in watched(path)
+    shutil.rmtree(tmp_path / "have")
+    tiny_model(vectors_space()).save("have")
+    assert "the model reads a, b" in refused(["have"], capsys)
 
 
 class Clipped(VecNormalize):

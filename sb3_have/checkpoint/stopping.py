@@ -36,6 +36,16 @@ def handle_signals(handler: Callable[[int, FrameType | None], None]) -> Iterator
             signal.signal(number, previous)
 
 
+@contextmanager
+def delay_signals() -> Iterator[None]:
+    """Let a ``with`` block finish before Ctrl-C or SIGTERM takes effect."""
+    received: list[int] = []
+    with handle_signals(lambda number, frame: received.append(number)):
+        yield
+    for number in received:
+        signal.raise_signal(number)
+
+
 class StopTrainingOnSignal(BaseCallback):
     """
     Callback for ending training between two rollouts on Ctrl-C, SIGTERM or after a time limit.
