@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 import zlib
 from collections import Counter
 from typing import Any
@@ -90,8 +89,8 @@ class Server:
 
     def disturb(self, sensor: str, **fault: Any) -> None:
         """
-        Disturb a sensor: ``drop`` n ticks, be n ticks ``late``, be ``slow`` by seconds, ``shift`` the frame number, or
-        ``corrupt`` the buffer.
+        Disturb a sensor: ``drop`` n ticks, be n ticks ``late``, send from a thread when a ``gate`` (a
+        ``threading.Event``) opens, ``shift`` the frame number, or ``corrupt`` the buffer.
         """
         self._faults[sensor] = fault
 
@@ -137,7 +136,7 @@ class Server:
         return found + self.violations
 
     def join(self) -> None:
-        """Wait for slow callbacks."""
+        """Wait for the callbacks in threads."""
         while self._threads:
             self._threads.pop().join()
 
@@ -263,7 +262,7 @@ class Server:
         if fault.get("late"):
             self._waiting.append((self.frame + fault["late"], sensor, data))
         else:
-            self._deliver(sensor, data, fault.get("slow", 0.0))
+            self._deliver(sensor, data, fault.get("gate"))
 
     def _deliver_late(self) -> None:
         due = [entry for entry in self._waiting if entry[0] <= self.frame + 1]
@@ -271,21 +270,22 @@ class Server:
         for _, sensor, data in due:
             self._deliver(sensor, data)
 
-    def _deliver(self, sensor: Sensor, data: SensorData, delay: float = 0.0) -> None:
+    def _deliver(self, sensor: Sensor, data: SensorData, gate: threading.Event | None = None) -> None:
         callback = sensor._callback
         if callback is None:
             return
 
         def run() -> None:
-            time.sleep(delay)
+            if gate is not None:
+                gate.wait()
             callback(data)
             data._buffer[:] = bytes(len(data._buffer))
 
-        if delay:
+        if gate is None:
+            run()
+        else:
             self._threads.append(threading.Thread(target=run, daemon=True))
             self._threads[-1].start()
-        else:
-            run()
 
 
 def _blueprint(name: str, attributes: dict[str, tuple[str, type]]) -> ActorBlueprint:

@@ -1,6 +1,7 @@
 """CarlaVision-v0 on the fake server: interface, observations, and where the vehicles are."""
 
 import hashlib
+import threading
 from typing import Any
 
 import gymnasium as gym
@@ -149,15 +150,18 @@ def events_by_hand(server: Server, frames: range, bins: int) -> NDArray[np.uint8
     return (128 + np.clip(counts, -127, 127)).astype(np.uint8)
 
 
-@pytest.mark.parametrize("slow", [0.0, 0.01], ids=["prompt", "slow"])
+@pytest.mark.parametrize("threads", [False, True])
 @pytest.mark.parametrize(("frequency", "bins"), [(5, 5), (20, 3)])
 def test_images_are_those_that_the_server_sent(
-    server: Server, start: Start, frequency: int, bins: int, slow: float
+    server: Server, start: Start, frequency: int, bins: int, threads: bool
 ) -> None:
-    for kind in (RGB, DEPTH, DVS):
-        server.disturb(kind, slow=slow)
+    if threads:
+        gate = threading.Event()
+        gate.set()
+        for kind in (RGB, DEPTH, DVS):
+            server.disturb(kind, gate=gate)
     # A long timeout and grace, because a busy machine runs threads late
-    env = start(policy_frequency=frequency, event={"bins": bins}, initial_speed=20.0, timeout=5.0, event_grace=5.0)
+    env = start(policy_frequency=frequency, event={"bins": bins}, initial_speed=20.0, timeout=60.0, event_grace=60.0)
     observation, _ = env.reset(seed=0)
     assert (observation["event"] == 128).all() and observation["event"].shape == (16, 16, bins)
     for _ in range(3):
