@@ -54,7 +54,8 @@ class Inbox(Generic[T]):
     def __init__(self, name: str, read: Callable[[Any], T]) -> None:
         self.name = name
         self._read = read
-        self._queue: queue.SimpleQueue[tuple[int, T] | Exception] = queue.SimpleQueue()
+        # Not a SimpleQueue: in Python 3.10, its get() can wait forever if the timeout is very short
+        self._queue: queue.Queue[tuple[int, T] | Exception] = queue.Queue()
 
     def __call__(self, data: Any) -> None:
         try:
