@@ -11,6 +11,7 @@ from envs import RandomSensors, image, sensors_space, tiny_model, vector, vector
 from gymnasium import spaces
 from onnx_parity import Uneven, assert_parity, enliven, input_types, metadata
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack
+from torch._subclasses import FakeTensorMode
 
 import sb3_have
 from sb3_have import HAVESAC
@@ -92,6 +93,12 @@ def test_vectors_and_modalities_of_several_keys(tmp_path: Path) -> None:
     found, types = metadata(path), input_types(path)
     assert found["modalities"] == modalities and found["frame_stack"] == 4 and found["algorithm"] is None
     assert types["tanh"] == ("tensor(double)", ["batch", 2, 2]) and types["add"] == ("tensor(int64)", ["batch", 2])
+
+
+def test_exports_do_not_fill_a_cache_of_pytorch(tmp_path: Path) -> None:
+    """It has no limit: every export would take another megabyte."""
+    export_onnx(tiny_model(vectors_space()), tmp_path / "policy.onnx")
+    assert FakeTensorMode.cache_info().size == 0
 
 
 def test_a_single_image(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """What a week of use does, in random order and with failing sensors: train, evaluate, record, save, resume, export."""
 
+import logging
 import multiprocessing
 import os
 import random
@@ -165,7 +166,12 @@ def test_soak() -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_soak_thoroughly() -> None:
     """All failures, and more than 200 episodes; nothing grows over the second half."""
-    samples = soak(weeks=len(FAILURES), actions=6)
+    # pytest would keep the debug messages of PyTorch's exporter
+    logging.disable(logging.DEBUG)
+    try:
+        samples = soak(weeks=len(FAILURES), actions=6)
+    finally:
+        logging.disable(logging.NOTSET)
     memory, files, processes = samples[len(samples) // 2 :].T
     print(f"resident {memory[0] / 1e6:.0f} to {memory[-1] / 1e6:.0f} MB, {files[-1]} files, {processes[-1]} processes")
     assert memory.max() < 1.05 * memory.min()

@@ -21,6 +21,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import preprocess_obs
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
+from torch._subclasses import FakeTensorMode
 
 from sb3_have.checkpoint.files import write_atomically
 from sb3_have.common.encoders import MultiModalEncoder
@@ -151,6 +152,8 @@ def _to_onnx(network: _Network, metadata: dict[str, str]) -> bytes:
             dynamo=True,
             verbose=False,
         )
+    # PyTorch would keep the shapes of every export
+    FakeTensorMode.cache_clear()
     assert program is not None
     # Values inside the graph may have the name of an input
     NameFixPass()(program.model)
