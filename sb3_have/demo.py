@@ -127,13 +127,12 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
     run = Run(on_features(config), ENV_ID, out, seed=seed, eval_freq=0, save_freq=0, time_limit=time_limit)
     limits = f"{steps} steps or {time_limit / 60:g} minutes"
     with phase(f"Training on the trained driver's encoders for {limits} (press Ctrl-C once to stop earlier)"):
-        learned = run.train(steps, keep_checkpoint=False)
-        assert isinstance(learned, HAVESAC)
-        env = make_training_env(ENV_ID, {**config, "n_envs": 1})
-        model = with_encoders(learned, config, env)
-        env.close()
-        write_atomically(out / "havesac_demo.zip", model.save)
-        (out / "model.zip").unlink()  # it reads features
+        try:
+            run.train(steps, keep_checkpoint=False)
+        finally:
+            # Even after a second Ctrl-C
+            if (out / "model.zip").exists():
+                model = join(out, config)
         milliseconds = 1e3 * run.seconds / max(1, model.num_timesteps)
         print(f"{model.num_timesteps} steps in {run.seconds:.0f} s, {milliseconds:.0f} ms per step")
 
@@ -173,6 +172,22 @@ def demo(steps: int, time_limit: float, n_episodes: int, seed: int, out: Path) -
         show(recording, out / "drive")
     print(f"Everything is in {out} after {(time.monotonic() - started) / 60:.1f} minutes.")
     return results
+
+
+def join(out: Path, config: dict[str, Any]) -> HAVESAC:
+    """
+    Replace ``model.zip``, which reads features, with ``havesac_demo.zip``, which has the encoders and reads images.
+
+    :param out: Folder of the demo
+    :param config: Configuration of the training on images
+    :return: The model that reads images
+    """
+    env = make_training_env(ENV_ID, {**config, "n_envs": 1})
+    model = with_encoders(HAVESAC.load(out / "model.zip"), config, env)
+    env.close()
+    write_atomically(out / "havesac_demo.zip", model.save)
+    (out / "model.zip").unlink()
+    return model
 
 
 def show(recording: Recording, path: Path) -> None:

@@ -198,13 +198,16 @@ class Run:
         model.set_logger(logger)
         self._started = time.monotonic()
         try:
-            with stop:
-                model.learn(
-                    max(0, steps - model.num_timesteps),
-                    callbacks,
-                    reset_num_timesteps=checkpoint is None,
-                    progress_bar=progress_bar,
-                )
+            try:
+                with stop:
+                    model.learn(
+                        max(0, steps - model.num_timesteps),
+                        callbacks,
+                        reset_num_timesteps=checkpoint is None,
+                        progress_bar=progress_bar,
+                    )
+            finally:
+                self.seconds += time.monotonic() - self._started
         except KeyboardInterrupt:
             # A second signal. Without checkpoints, only this keeps what was learned
             if not keep_checkpoint:
@@ -213,7 +216,6 @@ class Run:
         else:
             self._save(model)
         finally:
-            self.seconds += time.monotonic() - self._started
             logger.close()
             saving.release()
         self.interrupted = stop.interrupted

@@ -9,7 +9,7 @@ import pytest
 from fake_carla import Client, TrafficManager
 from fake_carla_server import Server
 
-from sb3_have.envs.carla_vision import CarlaVisionEnv, session
+from sb3_have.envs.carla_vision import CarlaVisionEnv, sensors, session
 
 # Small and quick options for the environment: with traffic, and without traffic and with the cheapest sensor
 SMALL: dict[str, Any] = {"image_size": 16, "vehicles_count": 2, "timeout": 0.2}
@@ -59,6 +59,17 @@ def works(server: Server, env: CarlaVisionEnv) -> None:
     assert env.step(FULL)[4]["distance"] > 0
     env.close()
     assert server.left_behind() == []
+
+
+def release_to_readers(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the server send what it holds when the environment begins to wait for data."""
+    wait = sensors.Inbox._next
+
+    def release_and_wait(box: sensors.Inbox[Any], deadline: float) -> Any:
+        server.release()
+        return wait(box, deadline)
+
+    monkeypatch.setattr(sensors.Inbox, "_next", release_and_wait)
 
 
 @pytest.fixture

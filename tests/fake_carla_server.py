@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import zlib
 from collections import Counter
+from collections.abc import Callable
 from typing import Any
 
 import carla
@@ -70,6 +71,7 @@ class Server:
             + [_blueprint(name, {key: (value, str) for key, value in car.items()}) for name, car in cars.items()]
         )
         self._count: Counter[str] = Counter()
+        self._held: list[tuple[Callable[[SensorData], None], SensorData]] = []
         self._threads: list[threading.Thread] = []
         self.heal()
         self.load(town)
@@ -89,8 +91,8 @@ class Server:
 
     def disturb(self, sensor: str, **fault: Any) -> None:
         """
-        Disturb a sensor: ``drop`` n ticks, be n ticks ``late``, send from a thread when a ``gate`` (a
-        ``threading.Event``) opens, ``shift`` the frame number, or ``corrupt`` the buffer.
+        Disturb a sensor: ``drop`` n ticks, be n ticks ``late``, ``hold`` the data until :meth:`release`, ``shift`` the
+        frame number, or ``corrupt`` the buffer.
         """
         self._faults[sensor] = fault
 
@@ -135,8 +137,19 @@ class Server:
         found += [f"traffic manager at {port} runs" for port, tm in self.traffic_managers.items() if tm._runs()]
         return found + self.violations
 
+    def release(self) -> None:
+        """Send from a thread, in its order, what sensors hold."""
+        held, self._held = self._held, []
+
+        def send_all() -> None:
+            for callback, data in held:
+                send(callback, data)
+
+        self._threads.append(threading.Thread(target=send_all, daemon=True))
+        self._threads[-1].start()
+
     def join(self) -> None:
-        """Wait for the callbacks in threads."""
+        """Wait for the threads."""
         while self._threads:
             self._threads.pop().join()
 
@@ -262,7 +275,7 @@ class Server:
         if fault.get("late"):
             self._waiting.append((self.frame + fault["late"], sensor, data))
         else:
-            self._deliver(sensor, data, fault.get("gate"))
+            self._deliver(sensor, data, bool(fault.get("hold")))
 
     def _deliver_late(self) -> None:
         due = [entry for entry in self._waiting if entry[0] <= self.frame + 1]
@@ -270,22 +283,19 @@ class Server:
         for _, sensor, data in due:
             self._deliver(sensor, data)
 
-    def _deliver(self, sensor: Sensor, data: SensorData, gate: threading.Event | None = None) -> None:
-        callback = sensor._callback
-        if callback is None:
+    def _deliver(self, sensor: Sensor, data: SensorData, hold: bool = False) -> None:
+        if sensor._callback is None:
             return
-
-        def run() -> None:
-            if gate is not None:
-                gate.wait()
-            callback(data)
-            data._buffer[:] = bytes(len(data._buffer))
-
-        if gate is None:
-            run()
+        if hold:
+            self._held.append((sensor._callback, data))
         else:
-            self._threads.append(threading.Thread(target=run, daemon=True))
-            self._threads[-1].start()
+            send(sensor._callback, data)
+
+
+def send(callback: Callable[[SensorData], None], data: SensorData) -> None:
+    """Call a sensor's callback; its data does not outlive the call."""
+    callback(data)
+    data._buffer[:] = bytes(len(data._buffer))
 
 
 def _blueprint(name: str, attributes: dict[str, tuple[str, type]]) -> ActorBlueprint:

@@ -3,7 +3,6 @@
 import gc
 import subprocess
 import sys
-import threading
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +14,7 @@ import pytest
 carla = pytest.importorskip("carla", reason="needs the client module of CARLA: pip install 'sb3_have[carla]'")
 
 import fake_carla_fixtures  # noqa: E402
-from fake_carla_fixtures import ALONE, FULL, SMALL, Start, fresh, install, works  # noqa: E402
+from fake_carla_fixtures import ALONE, FULL, SMALL, Start, fresh, install, release_to_readers, works  # noqa: E402
 from fake_carla_server import DEPTH, DVS, RGB, Server  # noqa: E402
 
 from sb3_have.configuration import evaluation_env_kwargs, load_config  # noqa: E402
@@ -240,14 +239,13 @@ def test_late_events_are_dropped_with_a_warning(server: Server, env: CarlaVision
 
 
 @pytest.mark.parametrize("grace", [0.0, 60.0])
-def test_event_grace(server: Server, start: Start, grace: float) -> None:
+def test_event_grace(server: Server, start: Start, monkeypatch: pytest.MonkeyPatch, grace: float) -> None:
     env = start(modalities=("event",), initial_speed=10.0, event_grace=grace)
-    gate = threading.Event()
-    server.disturb(DVS, gate=gate)
+    server.disturb(DVS, hold=True)
     if grace:
-        threading.Timer(0.05, gate.set).start()
+        release_to_readers(server, monkeypatch)
     assert (env.step(FULL)[0]["event"] != 128).any() == bool(grace)
-    gate.set()
+    server.release()
     server.join()
 
 

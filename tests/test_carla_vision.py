@@ -1,7 +1,6 @@
 """CarlaVision-v0 on the fake server: interface, observations, and where the vehicles are."""
 
 import hashlib
-import threading
 from typing import Any
 
 import gymnasium as gym
@@ -14,7 +13,7 @@ from stable_baselines3.common.env_checker import check_env as check_sb3_env
 carla = pytest.importorskip("carla", reason="needs the client module of CARLA: pip install 'sb3_have[carla]'")
 
 import fake_carla_fixtures  # noqa: E402
-from fake_carla_fixtures import ALONE, FULL, SMALL, STRAIGHT, Start, fresh  # noqa: E402
+from fake_carla_fixtures import ALONE, FULL, SMALL, STRAIGHT, Start, fresh, release_to_readers  # noqa: E402
 from fake_carla_server import COLLISION, DEPTH, DVS, RGB, Server  # noqa: E402
 
 from sb3_have.envs.carla_vision import CarlaVisionEnv  # noqa: E402
@@ -150,16 +149,15 @@ def events_by_hand(server: Server, frames: range, bins: int) -> NDArray[np.uint8
     return (128 + np.clip(counts, -127, 127)).astype(np.uint8)
 
 
-@pytest.mark.parametrize("threads", [False, True])
+@pytest.mark.parametrize("hold", [False, True], ids=["prompt", "slow"])
 @pytest.mark.parametrize(("frequency", "bins"), [(5, 5), (20, 3)])
 def test_images_are_those_that_the_server_sent(
-    server: Server, start: Start, frequency: int, bins: int, threads: bool
+    server: Server, start: Start, monkeypatch: pytest.MonkeyPatch, frequency: int, bins: int, hold: bool
 ) -> None:
-    if threads:
-        gate = threading.Event()
-        gate.set()
+    if hold:
         for kind in (RGB, DEPTH, DVS):
-            server.disturb(kind, gate=gate)
+            server.disturb(kind, hold=True)
+        release_to_readers(server, monkeypatch)
     # A long timeout and grace, because a busy machine runs threads late
     env = start(policy_frequency=frequency, event={"bins": bins}, initial_speed=20.0, timeout=60.0, event_grace=60.0)
     observation, _ = env.reset(seed=0)

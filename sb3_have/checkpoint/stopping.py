@@ -38,7 +38,7 @@ def handle_signals(handler: Callable[[int, FrameType | None], None]) -> Iterator
 
 @contextmanager
 def delay_signals() -> Iterator[None]:
-    """Let a ``with`` block finish before Ctrl-C or SIGTERM takes effect."""
+    """Let a ``with`` block finish before Ctrl-C or SIGTERM takes effect. If the block fails, its error does instead."""
     received: list[int] = []
     with handle_signals(lambda number, frame: received.append(number)):
         yield

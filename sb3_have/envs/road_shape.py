@@ -74,12 +74,12 @@ class RoadShape:
 
     def bend(self, x: Any) -> Any:
         """Offset of the road to the right of the x axis [m] at x [m]."""
-        return self.swing * (math.sin(_WAVE * x) if isinstance(x, float) else np.sin(_WAVE * x))
+        return self.swing * (np.sin(_WAVE * x) if isinstance(x, np.ndarray) else math.sin(_WAVE * x))
 
     def slope(self, x: Any) -> Any:
         """Return the derivative of :meth:`bend`, the tangent of the heading of the road at x [m]."""
         phase = _WAVE * x + 0.5 * math.pi
-        return self.swing * 2 * math.pi / PERIOD * (math.sin(phase) if isinstance(x, float) else np.sin(phase))
+        return self.swing * 2 * math.pi / PERIOD * (np.sin(phase) if isinstance(x, np.ndarray) else math.sin(phase))
 
     def direction(self, x: float) -> tuple[float, float]:
         """Return the unit vector along the road at x [m]."""
