@@ -19,11 +19,12 @@ from nbclient import NotebookClient
 FOLDER = Path(__file__).parent.parent / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 STEPS = "40"
-STRICT = """%reset -f
-import warnings
+RESET = "%reset -f\n"
+"""Before each notebook: a fresh namespace."""
+STRICT = """import warnings
 warnings.simplefilter("error")
 warnings.filterwarnings("ignore", "rich is experimental/alpha")"""
-"""Before each notebook: a fresh namespace, and warnings are errors as in the other tests."""
+"""Warnings are errors as in the other tests, unless pytest has filters on its command line."""
 
 each = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 
@@ -54,9 +55,10 @@ def test_there_are_six() -> None:
 
 
 @each
-def test_runs(path: Path, kernel: KernelManager) -> None:
+def test_runs(path: Path, kernel: KernelManager, pytestconfig: pytest.Config) -> None:
     notebook = nbformat.read(path, as_version=4)  # type: ignore[no-untyped-call]
-    notebook.cells.insert(0, nbformat.v4.new_code_cell(STRICT))  # type: ignore[no-untyped-call]
+    setup = RESET if pytestconfig.getoption("pythonwarnings") else RESET + STRICT
+    notebook.cells.insert(0, nbformat.v4.new_code_cell(setup))  # type: ignore[no-untyped-call]
     client = NotebookClient(notebook, km=kernel, timeout=None, startup_timeout=1800)
     try:
         client.execute()
