@@ -152,7 +152,7 @@ BOX = """
   <statistic extent="{extent}"/>
   <visual>
     <map znear="0.02" zfar="20"/>
-    <global fovy="4"/>
+    <global fovy="4" orthographic="true"/>
   </visual>
   <asset>{sky}</asset>
   <worldbody>
