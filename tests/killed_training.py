@@ -56,9 +56,9 @@ class MortalFile(io.FileIO):
 
 def prepare(moment: str, number: int) -> None:
     """Make the process die while it writes its ``number``-th checkpoint, or at its ``number``-th byte."""
-    original, calls = os.replace, 0
+    original, calls = Path.replace, 0
 
-    def replace(source: Path, target: Path) -> None:
+    def replace(source: Path, target: Path) -> Path:
         nonlocal calls
         calls += Path(target).name.startswith("checkpoint-")  # not another library's cache
         if calls == number and moment == "before renaming":
@@ -66,11 +66,12 @@ def prepare(moment: str, number: int) -> None:
         original(source, target)
         if calls == number:
             kill()
+        return Path(target)
 
     if moment == "byte":
         archive.open = lambda path, mode: io.BufferedWriter(MortalFile(path, number))  # type: ignore[attr-defined]
     elif moment.endswith("renaming"):
-        os.replace = replace  # type: ignore[assignment]
+        Path.replace = replace  # type: ignore[assignment, method-assign]
 
 
 def make_env() -> VecEnv:

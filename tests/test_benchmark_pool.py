@@ -16,7 +16,6 @@ from fake_drive import ENV_ID
 from tiny_grid import LocalPool, make_grid, read
 
 from sb3_have.algorithms import ALGORITHMS
-from sb3_have.benchmark import stages
 from sb3_have.benchmark.grid import FINAL_SEED
 from sb3_have.benchmark.reading import read_results
 from sb3_have.benchmark.results import is_finished
@@ -48,14 +47,15 @@ def processes_of_session(session: int) -> list[int]:
 def test_benchmark_survives_sigterm_sigkill_and_a_dead_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stop the benchmark, kill one worker, kill everything; in the end every run is finished, once."""
     pytest.importorskip("ray")
-    config = {"env_wrapper": "slow_drive.SlowUntil"}
+    config = {"env_wrapper": "slow_drive.Held"}
     grid = make_grid(tmp_path, config, seeds=[0], steps=150, save_freq=10, eval_freq=100)
-    runs, results, hurry = tmp_path / "runs", tmp_path / "results", tmp_path / "hurry"
+    runs, results, held = tmp_path / "runs", tmp_path / "results", tmp_path / "held"
+    held.mkdir()
     log = tmp_path / "log.txt"
     command = [sys.executable, "-m", "sb3_have.benchmark", "run", "mine.yml", "--workers", "2"]
     command += ["--runs", str(runs), "--results", str(results)]
     paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "HURRY": str(hurry)}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "HELD": str(held)}
     started: list[subprocess.Popen[bytes]] = []
 
     def start() -> subprocess.Popen[bytes]:
@@ -73,22 +73,29 @@ def test_benchmark_survives_sigterm_sigkill_and_a_dead_worker(tmp_path: Path, mo
             pid for pid in processes_of_session(session) if b"ray::_work" in Path(f"/proc/{pid}/cmdline").read_bytes()
         ]
 
+    def both_held() -> bool:
+        pids = pids_of_runs(started[-1].pid)
+        return len(pids) == 2 and all((held / str(pid)).exists() for pid in pids)
+
     jobs = grid.jobs()
     names = [job.name for job in jobs]
     try:
         process = start()
-        wait_until(lambda: all(stages.steps_done(runs / name) > 5 for name in names), process)
+        wait_until(both_held, process)
         os.killpg(process.pid, signal.SIGTERM)  # Ray's own processes are hit too
+        (held / "slowly").touch()
         assert process.wait() == STOPPED, log.read_text()
+        (held / "slowly").unlink()
         stopped = {name: steps(name) for name in names}
-        assert all(step > 5 for step in stopped.values())
+        assert all(stopped.values())
 
         process = start()
-        wait_until(lambda: all(steps(name) > stopped[name] for name in names), process)
+        wait_until(both_held, process)
+        known = {name: steps(name) for name in names}
+        assert all(known[name] > stopped[name] for name in names)
         os.kill(pids_of_runs(process.pid)[0], signal.SIGKILL)
         wait_until(lambda: "resuming from its checkpoint, attempt 2 of 3" in log.read_text(), process)
-        known = {name: steps(name) for name in names}
-        wait_until(lambda: all(steps(name) > known[name] for name in names), process)
+        wait_until(both_held, process)
         for pid in processes_of_session(process.pid):
             os.kill(pid, signal.SIGKILL)
         process.wait()
@@ -97,10 +104,10 @@ def test_benchmark_survives_sigterm_sigkill_and_a_dead_worker(tmp_path: Path, mo
             for pid in processes_of_session(process.pid):
                 os.kill(pid, signal.SIGKILL)
     killed = {name: steps(name) for name in names}
-    assert all(known[name] < killed[name] < 150 for name in names)
+    assert sorted(killed[name] > known[name] for name in names) == [False, True], "only one of them was resumed"
 
-    hurry.touch()
-    monkeypatch.setenv("HURRY", str(hurry))
+    (held / "freely").touch()
+    monkeypatch.setenv("HELD", str(held))
     assert Runner(jobs, runs, results).run(LocalPool(lambda job: run_job(job, runs))) == FINISHED
     assert all((runs / name / f"log-{killed[name]}").exists() for name in names)
     read_results([results])

@@ -144,7 +144,7 @@ def test_full_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str) 
                 if where == "write":
                     monkeypatch.setattr(zipfile._ZipWriteFile, "write", full_disk)  # type: ignore[attr-defined]
                 else:
-                    monkeypatch.setattr(os, where, full_disk)
+                    monkeypatch.setattr(Path if where == "replace" else os, where, full_disk)
             return super()._on_step()
 
     with pytest.warns(
@@ -214,12 +214,12 @@ def test_file_and_folder_are_synced_before_and_after_renaming(tmp_path: Path, mo
     def fsync(handle: int) -> None:
         done.append("folder" if os.path.isdir(f"/proc/self/fd/{handle}") else "file")
 
-    def replace(source: Path, target: Path) -> None:
+    def replace(source: Path, target: Path) -> Path:
         done.append("renamed")
-        os.rename(source, target)
+        return source.rename(target)
 
     monkeypatch.setattr(os, "fsync", fsync)
-    monkeypatch.setattr(os, "replace", replace)
+    monkeypatch.setattr(Path, "replace", replace)
     write_archive(tmp_path / "file", {}, memoryview(b"model"), {})
     assert done == ["file", "renamed", "folder"]
 

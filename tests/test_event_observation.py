@@ -6,6 +6,7 @@ from typing import Any
 
 import cv2
 import gymnasium as gym
+import highway_env  # noqa: F401  registers highway-v0
 import numpy as np
 import pytest
 from gymnasium import spaces

@@ -105,7 +105,7 @@ def test_a_pickle_in_place_of_a_file_is_refused(folder: Path, marker: Path, name
 def test_a_pickle_behind_the_weights_is_refused(folder: Path, marker: Path, form: str) -> None:
     file = folder / "model.safetensors"
     file.write_bytes(file.read_bytes() + FORMS[form](Poison(marker)))
-    with pytest.raises(ValueError, match=r"model\.safetensors: .*metadata"):
+    with pytest.raises(ValueError, match=r"model\.safetensors: .*(?i:metadata)"):
         load_policy(folder, "cpu")
     assert not marker.exists()
 
