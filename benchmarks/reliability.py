@@ -29,7 +29,7 @@ import pandas as pd
 
 from benchmarks.measure import RESULTS
 from benchmarks.reliability_report import report
-from benchmarks.reliability_runs import EVALUATION_SEED, METHODS, REMOVED, VARIANTS, run
+from benchmarks.reliability_runs import DISTRIBUTIONAL, EVALUATION_SEED, METHODS, REMOVED, VARIANTS, run
 
 DEFAULT_METHODS = ("gve", "gve-wide", "lve", "have", "have-dropout", "have-unsupervised")
 N_UPDATES = 8000
@@ -98,7 +98,7 @@ def _run(method: str, seed: int, n_updates: int, *given: Any) -> list[tuple[str,
 
 def load(folder: Path) -> pd.DataFrame:
     """Load the rows of all runs in a folder, which may also contain other tables."""
-    files = [folder / f"{method}.csv" for method in (*METHODS, *VARIANTS, *REMOVED)]
+    files = [folder / f"{method}.csv" for method in (*METHODS, *VARIANTS, *DISTRIBUTIONAL, *REMOVED)]
     tables = [pd.read_csv(file) for file in files if file.exists()]
     return pd.concat(tables, ignore_index=True) if tables else pd.DataFrame(columns=COLUMNS)
 
@@ -125,7 +125,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--methods",
         nargs="+",
-        choices=[*METHODS, *VARIANTS],
+        choices=[*METHODS, *VARIANTS, *DISTRIBUTIONAL],
         default=list(DEFAULT_METHODS),
         help="in this order",
     )

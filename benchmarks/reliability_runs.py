@@ -12,6 +12,7 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
+from benchmarks.distributional import FROM_REWARDS, TWO_HOT_SYMLOG, DistributionalHAVESAC
 from benchmarks.known_q import Floats, auc, negative_gradient
 from benchmarks.reliability_vec_env import ReliabilityDriveVecEnv
 from sb3_have import HAVESAC
@@ -39,6 +40,16 @@ VARIANTS: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "have-dropout-0.1": {"modality_dropout": 0.1},
         "have-dropout-0.4": {"modality_dropout": 0.4},
         "lve-dropout": {"value_estimation": "lve", "modality_dropout": 0.2},
+    }
+)
+# Arguments of DistributionalHAVESAC per method, see benchmarks.distributional
+DISTRIBUTIONAL: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {
+        "have-distributional": {},
+        "lve-distributional": {"value_estimation": "lve"},
+        "gve-wide-distributional": {"value_estimation": "gve"},
+        "have-distributional-rewards": {"policy_kwargs": {"atoms": FROM_REWARDS}},
+        "have-distributional-symlog": {"policy_kwargs": {"atoms": TWO_HOT_SYMLOG}},
     }
 )
 # Variants whose results are kept; their code was removed after commit 16a9471, because they showed no gain
@@ -125,17 +136,19 @@ def make_model(method: str, seed: int, task: Mapping[str, Any] | None = None, **
     """
     Create the model of a method.
 
-    :param method: One of ``METHODS`` or ``VARIANTS``
+    :param method: One of ``METHODS``, ``VARIANTS`` or ``DISTRIBUTIONAL``
     :param seed: Seed of networks, environments and exploration
     :param task: Options of the environment
     :param kwargs: Arguments of HAVESAC that replace those of the method
     :return: The model
     """
-    settings = {**HYPERPARAMETERS, **{**METHODS, **VARIANTS}[method], "policy_kwargs": policy_kwargs(WIDTH)}
-    if method.startswith("gve-wide"):
-        settings["policy_kwargs"] = policy_kwargs(gve_width())
+    distributional = method in DISTRIBUTIONAL
+    settings = {**HYPERPARAMETERS, **{**METHODS, **VARIANTS, **DISTRIBUTIONAL}[method]}
+    width = gve_width(distributional) if method.startswith("gve-wide") else WIDTH
+    settings["policy_kwargs"] = {**policy_kwargs(width), **settings.get("policy_kwargs", {})}
     env = ReliabilityDriveVecEnv(N_ENVS, n_modalities=N_MODALITIES, **(task or {}))
-    return HAVESAC("MultiInputPolicy", env, seed=seed, device="cpu", **{**settings, **kwargs})
+    algorithm = DistributionalHAVESAC if distributional else HAVESAC
+    return algorithm("MultiInputPolicy", env, seed=seed, device="cpu", **{**settings, **kwargs})
 
 
 def policy_kwargs(width: int) -> dict[str, Any]:
@@ -143,21 +156,22 @@ def policy_kwargs(width: int) -> dict[str, Any]:
     return {"features_dim": 32, "net_arch": {"pi": [WIDTH, WIDTH], "qf": [width, width]}}
 
 
-def critic_size(width: int, value_estimation: str) -> int:
+def critic_size(width: int, value_estimation: str, distributional: bool = False) -> int:
     """Count the parameters of encoders and critics for a width of the critics' hidden layers."""
-    model = make_model("have", 0, value_estimation=value_estimation, policy_kwargs=policy_kwargs(width))
+    method = "have-distributional" if distributional else "have"
+    model = make_model(method, 0, value_estimation=value_estimation, policy_kwargs=policy_kwargs(width))
     return sum(parameter.numel() for parameter in model.critic.parameters())
 
 
 @cache
-def gve_width() -> int:
+def gve_width(distributional: bool = False) -> int:
     """Find the width at which a global critic alone has as many parameters as all critics of HAVE, within 1%."""
-    wanted = critic_size(WIDTH, "have")
+    wanted = critic_size(WIDTH, "have", distributional)
     low, high = WIDTH, 16 * WIDTH
     while low < high:
         middle = (low + high) // 2
-        low, high = (middle + 1, high) if critic_size(middle, "gve") < wanted else (low, middle)
-    assert abs(critic_size(low, "gve") / wanted - 1) < 0.01
+        low, high = (middle + 1, high) if critic_size(middle, "gve", distributional) < wanted else (low, middle)
+    assert abs(critic_size(low, "gve", distributional) / wanted - 1) < 0.01
     return low
 
 
