@@ -31,15 +31,16 @@ def wait_until(happened: Callable[[], bool], process: subprocess.Popen[bytes]) -
         time.sleep(0.05)
 
 
-def processes_of_session(session: int) -> list[int]:
+def processes_of_session(session: int, name: bytes = b"") -> list[int]:
+    """List the processes of a session whose command line contains a name."""
     found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
+    for process in Path("/proc").glob("[0-9]*"):
         try:
-            fields = stat.read_text().rpartition(")")[2].split()
+            fields = (process / "stat").read_text().rpartition(")")[2].split()
+            if int(fields[3]) == session and name in (process / "cmdline").read_bytes():
+                found.append(int(process.name))
         except OSError:  # the process has just ended
             continue
-        if int(fields[3]) == session:
-            found.append(int(stat.parent.name))
     return found
 
 
@@ -68,13 +69,11 @@ def test_benchmark_survives_sigterm_sigkill_and_a_dead_worker(tmp_path: Path, mo
         checkpoint = newest_checkpoint(runs / name)
         return 0 if checkpoint is None else checkpoint_step(checkpoint)
 
-    def pids_of_runs(session: int) -> list[int]:
-        return [
-            pid for pid in processes_of_session(session) if b"ray::_work" in Path(f"/proc/{pid}/cmdline").read_bytes()
-        ]
+    def pids_of_runs() -> list[int]:
+        return processes_of_session(started[-1].pid, b"ray::_work")
 
     def both_held() -> bool:
-        pids = pids_of_runs(started[-1].pid)
+        pids = pids_of_runs()
         return len(pids) == 2 and all((held / str(pid)).exists() for pid in pids)
 
     jobs = grid.jobs()
@@ -93,7 +92,7 @@ def test_benchmark_survives_sigterm_sigkill_and_a_dead_worker(tmp_path: Path, mo
         wait_until(both_held, process)
         known = {name: steps(name) for name in names}
         assert all(known[name] > stopped[name] for name in names)
-        os.kill(pids_of_runs(process.pid)[0], signal.SIGKILL)
+        os.kill(pids_of_runs()[0], signal.SIGKILL)
         wait_until(lambda: "resuming from its checkpoint, attempt 2 of 3" in log.read_text(), process)
         wait_until(both_held, process)
         for pid in processes_of_session(process.pid):
