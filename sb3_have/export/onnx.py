@@ -152,9 +152,8 @@ def _to_onnx(network: _Network, metadata: dict[str, str]) -> bytes:
             dynamo=True,
             verbose=False,
         )
-    # PyTorch would keep the shapes of every export
-    FakeTensorMode.cache_clear()
-    assert program is not None
+    assert program is not None and program.exported_program is not None
+    _forget_shapes(program.exported_program)
     # Values inside the graph may have the name of an input
     NameFixPass()(program.model)
     # PyTorch notes the source file of each node
@@ -163,6 +162,18 @@ def _to_onnx(network: _Network, metadata: dict[str, str]) -> bytes:
     program.model.metadata_props.update(metadata)
     content: bytes = program.model_proto.SerializeToString()
     return content
+
+
+def _forget_shapes(program: th.export.ExportedProgram) -> None:
+    """
+    Free the shapes of an export, about 1 MB. PyTorch would keep them: they refer to themselves through C++, where
+    Python's garbage collector does not see it, and caches refer to them.
+    """
+    FakeTensorMode.cache_clear()
+    for node in program.graph.nodes:
+        mode = getattr(node.meta.get("val"), "fake_mode", None)
+        if mode is not None and mode.shape_env is not None:
+            vars(mode.shape_env).clear()
 
 
 def _sample(space: spaces.Space[Any], batch_size: int) -> dict[str, np.ndarray]:
