@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import torch as th
 import torch.nn.functional as F
@@ -24,25 +24,27 @@ from sb3_have import HAVESAC, MultiModalPolicy
 from sb3_have.common.networks import ParallelLinear
 from sb3_have.have.critic import MultiModalCritic, Values
 
+# Standard deviation of a projected target in atoms, as in HL-Gauss (Farebrother et al. 2024)
+SIGMA = 0.75
+
 
 @dataclass(frozen=True)
 class Atoms:
     """
-    Returns that a distribution can take, and the projection of a scalar target on them.
+    The support of the distributions, and the projection of scalar targets onto it.
 
-    :param low: Lowest return of a linear scale, or of its symlog
-    :param high: Highest return, or its symlog
+    :param low: Lowest return, or its symlog if ``symlog``
+    :param high: Highest return, or its symlog if ``symlog``
     :param number: Number of atoms (m)
-    :param symlog: Whether the atoms are equally spaced in symlog(x) = sign(x) log(1 + |x|), as in DreamerV3
-    :param sigma: Standard deviation of the projected target in atoms (HL-Gauss, Farebrother et al. 2024), or 0 for a
-        two-hot target, which keeps the mean
+    :param symlog: Whether the atoms are equally spaced in symlog(x) = sign(x) log(1 + |x|) and targets are projected
+        onto the two atoms next to them, as in DreamerV3. Otherwise the atoms are equally spaced, and a target becomes a
+        normal distribution that is integrated over each atom's bin (HL-Gauss).
     """
 
     low: float
     high: float
     number: int = 81
     symlog: bool = False
-    sigma: float = 0.75
 
     def values(self) -> th.Tensor:
         """Return the atoms (m,)."""
@@ -51,54 +53,61 @@ class Atoms:
 
     def project(self, target: th.Tensor) -> th.Tensor:
         """
-        Return the distribution (B, m) for scalar targets (B,). A target beyond the ends counts as an end.
+        Project scalar targets (B,) to distributions (B, m). Targets outside the range are clipped.
 
         :param target: Regression target
         """
         atoms = self.values().to(target)
         target = target.clamp(atoms[0], atoms[-1])
-        if self.sigma == 0:
+        if self.symlog:
             above = th.searchsorted(atoms, target).clamp(1, self.number - 1)
             share = (target - atoms[above - 1]) / (atoms[above] - atoms[above - 1])
             distribution = target.new_zeros(len(target), self.number)
             distribution.scatter_(1, (above - 1).unsqueeze(1), (1 - share).unsqueeze(1))
             return distribution.scatter_(1, above.unsqueeze(1), share.unsqueeze(1))
-        if self.symlog:
-            target = target.sign() * target.abs().log1p()
         width = (self.high - self.low) / (self.number - 1)
         edges = th.linspace(self.low - width / 2, self.high + width / 2, self.number + 1).to(target)
-        below = th.erf((edges - target.unsqueeze(1)) / (math.sqrt(2) * self.sigma * width))
+        below = th.erf((edges - target.unsqueeze(1)) / (math.sqrt(2) * SIGMA * width))
         return below.diff(dim=1) / (below[:, -1:] - below[:, :1])
 
 
-# A range that contains the returns of ReliabilityDrive-v0 and of the driving benchmark with gamma .98
+# A range around the soft returns of ReliabilityDrive-v0 and of the driving benchmark with gamma .98
 FIXED = Atoms(-25.0, 55.0)
-# From the lowest and highest reward of random actions on ReliabilityDrive-v0 (-0.83 and 1.36) over 1 - gamma
+# Lowest and highest reward over 1 - gamma: -0.83 and 1.36 in the 800 random steps with seed 0 that start a training
 FROM_REWARDS = Atoms(-41.0, 68.0)
-TWO_HOT_SYMLOG = Atoms(-10.0, 10.0, number=161, symlog=True, sigma=0.0)
+SYMLOG = Atoms(-10.0, 10.0, number=161, symlog=True)
 
 
-class DistributionalValues(NamedTuple):
-    """Expected values as in :class:`~sb3_have.have.critic.Values`, and the logarithms of the distributions."""
+class DistributionalValues(Values):
+    """Expected values, and the logarithms of the distributions."""
 
-    q: th.Tensor
-    q_global: th.Tensor | None
-    q_local: th.Tensor | None
-    q_lve: th.Tensor | None
-    weights: th.Tensor | None
     log_p: th.Tensor
     """(K, B, m): of q."""
     log_parts: tuple[th.Tensor, ...]
-    """(K, ..., B, m): of the local values, and with re-fusion of the global value and LVE too."""
+    """(K, ..., B, m): of the local values and, with re-fusion, also of the global value and LVE."""
+
+
+def distributional(values: Values, log_p: th.Tensor, *log_parts: th.Tensor) -> DistributionalValues:
+    """Add distributions to expected values."""
+    result = DistributionalValues(*values)
+    result.log_p, result.log_parts = log_p, log_parts
+    return result
 
 
 class DistributionalCritic(MultiModalCritic):
-    """:class:`~sb3_have.have.critic.MultiModalCritic` with distributions; its re-fusion is "convex"."""
+    """
+    :class:`~sb3_have.have.critic.MultiModalCritic` with distributions.
+
+    :param atoms: Support of the distributions and projection of the targets
+    :raises ValueError: for a re-fusion other than "convex", which would not be a mixture
+    """
 
     atoms: th.Tensor
 
     def __init__(self, *args: Any, atoms: Atoms = FIXED, **kwargs: Any):
         super().__init__(*args, **kwargs)
+        if self.value_estimation == "have" and self.refusion.refusion != "convex":
+            raise ValueError(f'refusion={self.refusion.refusion!r}: distributional critics need "convex".')
         self.project = atoms.project
         self.register_buffer("atoms", atoms.values(), persistent=False)
         # Start far from the ends of the range, with the same distribution for all observations
@@ -112,48 +121,41 @@ class DistributionalCritic(MultiModalCritic):
                     net[-1].weight.zero_()
                     net[-1].bias.copy_(logits.expand_as(net[-1].bias))
 
-    def values(self, features: th.Tensor, actions: th.Tensor) -> Values:
+    def values(self, features: th.Tensor, actions: th.Tensor) -> DistributionalValues:
         """
         Compute the Q-values, their parts and the distributions.
 
         :param features: (B, d, F)
         :param actions: (B, A), scaled to [-1, 1]
         """
-        weights = log_global = log_local = log_lve = None
-        if self.value_estimation != "lve":
+        if self.value_estimation == "gve":
             log_global = F.log_softmax(self.global_critic(features, actions), dim=2)
-        if self.value_estimation != "gve":
-            # (K, d, B, m)
-            log_local = F.log_softmax(self.local_critics(features, actions).unflatten(2, (len(features), -1)), dim=3)
-            weights = self.weights(features)
-            # A weight of exactly 0 would have an infinite gradient
-            log_weights = weights.clamp_min(1e-30).log().t().unsqueeze(2)  # (d, B, 1)
-            log_lve = th.logsumexp(log_local + log_weights, dim=1)  # Eq. 6
-        parts: tuple[th.Tensor, ...] = ()
-        if self.value_estimation == "have":
-            assert log_global is not None and log_lve is not None and log_local is not None
-            log_gate = F.log_softmax(self.refusion.gate(features.flatten(start_dim=1)), dim=1)  # (B, 2)
-            log_p = th.logaddexp(log_global + log_gate[:, :1], log_lve + log_gate[:, 1:])  # section 3.4
-            parts = (log_local, log_global, log_lve)
-        elif log_lve is not None and log_local is not None:
-            log_p, parts = log_lve, (log_local,)
-        else:
-            assert log_global is not None
-            log_p = log_global
-        q_global, q_local, q_lve = (
-            None if log is None else log.exp() @ self.atoms for log in (log_global, log_local, log_lve)
-        )
-        values = DistributionalValues(
-            log_p.exp() @ self.atoms, q_global, q_local, q_lve, weights, log_p=log_p, log_parts=parts
-        )
-        return values  # type: ignore[return-value]
+            q_global = self._mean(log_global)
+            return distributional(Values(q_global, q_global, None, None, None), log_global)
+        # (K, d, B, m)
+        log_local = F.log_softmax(self.local_critics(features, actions).unflatten(2, (len(features), -1)), dim=3)
+        weights = self.weights(features)
+        # log(0) would make the gradient NaN
+        log_weights = weights.clamp_min(1e-30).log().t().unsqueeze(2)  # (d, B, 1)
+        log_lve = th.logsumexp(log_local + log_weights, dim=1)  # Eq. 6
+        q_local, q_lve = self._mean(log_local), self._mean(log_lve)
+        if self.value_estimation == "lve":
+            return distributional(Values(q_lve, None, q_local, q_lve, weights), log_lve, log_local)
+        log_global = F.log_softmax(self.global_critic(features, actions), dim=2)
+        log_gate = F.log_softmax(self.refusion.gate(features.flatten(start_dim=1)), dim=1)  # (B, 2)
+        log_p = th.logaddexp(log_global + log_gate[:, :1], log_lve + log_gate[:, 1:])  # section 3.4
+        values = Values(self._mean(log_p), self._mean(log_global), q_local, q_lve, weights)
+        return distributional(values, log_p, log_local, log_global, log_lve)
+
+    def _mean(self, log_p: th.Tensor) -> th.Tensor:
+        return log_p.exp() @ self.atoms
 
 
 class DistributionalPolicy(MultiModalPolicy):
     """
     Policy with a :class:`DistributionalCritic`.
 
-    :param atoms: Range and projection
+    :param atoms: Support of the distributions and projection of the targets
     """
 
     critic_class: ClassVar[type[MultiModalCritic]] = DistributionalCritic
@@ -185,7 +187,7 @@ class DistributionalHAVESAC(HAVESAC):
         projected = self.critic.project(target_q)
 
         def cross_entropy(log_p: th.Tensor) -> th.Tensor:
-            return -(projected * log_p).sum(dim=-1).mean(dim=tuple(range(1, log_p.dim() - 1))).sum()
+            return -(projected * log_p).sum(dim=-1).flatten(start_dim=1).mean(dim=1).sum()
 
         loss = cross_entropy(values.log_p)
         if self.local_coef > 0:

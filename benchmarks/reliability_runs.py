@@ -12,7 +12,7 @@ import numpy as np
 import torch as th
 from numpy.typing import NDArray
 
-from benchmarks.distributional import FROM_REWARDS, TWO_HOT_SYMLOG, DistributionalHAVESAC
+from benchmarks.distributional import FROM_REWARDS, SYMLOG, DistributionalHAVESAC
 from benchmarks.known_q import Floats, auc, negative_gradient
 from benchmarks.reliability_vec_env import ReliabilityDriveVecEnv
 from sb3_have import HAVESAC
@@ -49,7 +49,7 @@ DISTRIBUTIONAL: Mapping[str, Mapping[str, Any]] = MappingProxyType(
         "lve-distributional": {"value_estimation": "lve"},
         "gve-wide-distributional": {"value_estimation": "gve"},
         "have-distributional-rewards": {"policy_kwargs": {"atoms": FROM_REWARDS}},
-        "have-distributional-symlog": {"policy_kwargs": {"atoms": TWO_HOT_SYMLOG}},
+        "have-distributional-symlog": {"policy_kwargs": {"atoms": SYMLOG}},
     }
 )
 # Variants whose results are kept; their code was removed after commit 16a9471, because they showed no gain
@@ -186,7 +186,7 @@ def run(
     """
     Train a method and measure it.
 
-    :param method: One of ``METHODS`` or ``VARIANTS``
+    :param method: One of ``METHODS``, ``VARIANTS`` or ``DISTRIBUTIONAL``
     :param seed: Seed of the training; the evaluation episodes are the same for all
     :param n_updates: Number of updates of the critic
     :param task: Options of the environment, ``n_blind`` and ``corruption``

@@ -63,10 +63,10 @@ def prepare(moment: str, number: int) -> None:
         calls += Path(target).name.startswith("checkpoint-")  # not another library's cache
         if calls == number and moment == "before renaming":
             kill()
-        original(source, target)
+        renamed = original(source, target)
         if calls == number:
             kill()
-        return Path(target)
+        return renamed
 
     if moment == "byte":
         archive.open = lambda path, mode: io.BufferedWriter(MortalFile(path, number))  # type: ignore[attr-defined]

@@ -15,9 +15,8 @@ counter = itertools.count(1)
 
 class Held(gym.Wrapper[Any, Any, Any, Any]):
     """
-    Holds a run after ``STEPS`` steps of its process and says so by a file with the number of the process, in the folder
-    that is named in the environment variable ``HELD``. A file "slowly" there lets the run go on slowly, and a file
-    "freely" does not hold it at all.
+    Holds a run after ``STEPS`` steps of its process and creates a file named after its process ID in the folder
+    ``$HELD``. A file "slowly" there lets the run continue slowly; a file "freely" turns holding off.
     """
 
     def step(self, action: Any) -> Any:
@@ -26,5 +25,5 @@ class Held(gym.Wrapper[Any, Any, Any, Any]):
             (folder / str(os.getpid())).touch()
             while not (folder / "slowly").exists():
                 time.sleep(0.01)
-            time.sleep(0.5)
+            time.sleep(2)
         return super().step(action)

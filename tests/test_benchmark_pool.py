@@ -6,6 +6,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,12 @@ def processes_of_session(session: int, name: bytes = b"") -> list[int]:
     return found
 
 
+def kill_session(session: int) -> None:
+    for pid in processes_of_session(session):
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
 @pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="finds the processes to kill in /proc")
 def test_benchmark_survives_sigterm_sigkill_and_a_dead_worker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stop the benchmark, kill one worker, kill everything; in the end every run is finished, once."""
@@ -54,7 +61,14 @@ def test_benchmark_survives_sigterm_sigkill_and_a_dead_worker(tmp_path: Path, mo
     held.mkdir()
     log = tmp_path / "log.txt"
     command = [sys.executable, "-m", "sb3_have.benchmark", "run", "mine.yml", "--workers", "2"]
-    command += ["--runs", str(runs), "--results", str(results)]
+    command += [
+        "--runs",
+        str(runs),
+        "--results",
+        str(results),
+        "--time-limit",
+        "1800",
+    ]  # not to outlive pytest for long
     paths = [str(Path(__file__).parent), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "HELD": str(held)}
     started: list[subprocess.Popen[bytes]] = []
@@ -82,6 +96,7 @@ def test_benchmark_survives_sigterm_sigkill_and_a_dead_worker(tmp_path: Path, mo
         process = start()
         wait_until(both_held, process)
         os.killpg(process.pid, signal.SIGTERM)  # Ray's own processes are hit too
+        wait_until(lambda: "stopping:" in log.read_text(), process)
         (held / "slowly").touch()
         assert process.wait() == STOPPED, log.read_text()
         (held / "slowly").unlink()
@@ -95,13 +110,11 @@ def test_benchmark_survives_sigterm_sigkill_and_a_dead_worker(tmp_path: Path, mo
         os.kill(pids_of_runs()[0], signal.SIGKILL)
         wait_until(lambda: "resuming from its checkpoint, attempt 2 of 3" in log.read_text(), process)
         wait_until(both_held, process)
-        for pid in processes_of_session(process.pid):
-            os.kill(pid, signal.SIGKILL)
+        kill_session(process.pid)
         process.wait()
     finally:
         for process in started:
-            for pid in processes_of_session(process.pid):
-                os.kill(pid, signal.SIGKILL)
+            kill_session(process.pid)
     killed = {name: steps(name) for name in names}
     assert sorted(killed[name] > known[name] for name in names) == [False, True], "only one of them was resumed"
 

@@ -28,9 +28,17 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(reliability_runs, name, value)
 
 
-@pytest.mark.parametrize("method,ratio", [("gve-wide", 1.0), ("gve-wide-dropout", 1.0), ("gve", 0.44)])
-def test_wide_critic_is_as_large_as_have(method: str, ratio: float) -> None:
-    sizes = [sum(p.numel() for p in make_model(name, 0).critic.parameters()) for name in (method, "have")]
+@pytest.mark.parametrize(
+    "method,have,ratio",
+    [
+        ("gve-wide", "have", 1.0),
+        ("gve-wide-dropout", "have", 1.0),
+        ("gve", "have", 0.44),
+        ("gve-wide-distributional", "have-distributional", 1.0),
+    ],
+)
+def test_wide_critic_is_as_large_as_have(method: str, have: str, ratio: float) -> None:
+    sizes = [sum(p.numel() for p in make_model(name, 0).critic.parameters()) for name in (method, have)]
     assert sizes[0] / sizes[1] == pytest.approx(ratio, abs=0.01)
 
 
@@ -159,7 +167,9 @@ def test_kept_return_is_a_share_of_the_clean_one(monkeypatch: pytest.MonkeyPatch
 
 
 @pytest.mark.usefixtures("small")
-@pytest.mark.parametrize("method,expected", [("have", 0.0), ("have-monotone", 0.0), ("free", 0.5)])
+@pytest.mark.parametrize(
+    "method,expected", [("have", 0.0), ("have-monotone", 0.0), ("free", 0.5), ("have-distributional", 0.0)]
+)
 def test_negative_gradient_of_a_run(monkeypatch: pytest.MonkeyPatch, method: str, expected: float) -> None:
     monkeypatch.setattr(reliability_runs, "METHODS", {**METHODS, "free": {"refusion": "free"}})
     share = reliability_runs.run(method, 0, 16)["negative_gradient"]

@@ -100,16 +100,16 @@ class Runner:
                 self.stopping = True
             if self.stopping and stopped_at is None:
                 stopped_at = time.monotonic()
-                bar.write(f"stopping: {len(pool.running)} runs are saving checkpoints")
+                _write(bar, f"stopping: {len(pool.running)} runs are saving checkpoints")
                 pool.stop()
             elif stopped_at is not None and time.monotonic() - stopped_at > GRACE_SECONDS:
-                bar.write(f"gave up waiting for {', '.join(job.name for job in pool.running)}")
+                _write(bar, f"gave up waiting for {', '.join(job.name for job in pool.running)}")
                 return
             # Start runs on free workers and collect those that ended
             while self._todo and len(pool.running) < pool.workers and not self.stopping:
                 pool.start(self._todo.popleft())
             for job, outcome in pool.wait(REFRESH_SECONDS):
-                bar.write(self._settle(job, outcome))
+                _write(bar, self._settle(job, outcome))
             bar.set_postfix_str(", ".join(job.name for job in pool.running), refresh=False)
             bar.n = self._steps()
             bar.update(0)
@@ -177,6 +177,12 @@ class Runner:
         finally:
             for number, handler in before.items():
                 signal.signal(number, handler)
+
+
+def _write(bar: tqdm[Any], line: str) -> None:
+    """Print a line above the bar, at once even into a file."""
+    bar.write(line)
+    sys.stdout.flush()
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -166,8 +166,8 @@ def _to_onnx(network: _Network, metadata: dict[str, str]) -> bytes:
 
 def _forget_shapes(program: th.export.ExportedProgram) -> None:
     """
-    Free the shapes of an export, about 1 MB. PyTorch would keep them: they refer to themselves through C++, where
-    Python's garbage collector does not see it, and caches refer to them.
+    Free the shapes of an export (about 1 MB). Caches refer to them, and they form cycles through C++ objects that
+    Python's garbage collector cannot see.
     """
     FakeTensorMode.cache_clear()
     for node in program.graph.nodes:
