@@ -41,11 +41,11 @@ def test_policy_delay(calls: list[int]) -> None:
     assert (actor_steps, critic_steps) == (2, 6)
 
 
-@pytest.mark.parametrize("name", ["policy_delay", "target_update_interval"])
-@pytest.mark.parametrize("interval", [0, -1, 1.5])
-def test_intervals_that_make_no_sense(name: str, interval: float) -> None:
-    with pytest.raises(ValueError, match=f"{name}={interval}"):
-        tiny_model(vectors_space(), None, **{name: interval})
+@pytest.mark.parametrize("name", ["buffer_size", "policy_delay", "target_update_interval"])
+@pytest.mark.parametrize("number", [0, -1, 1.5, 1e3])
+def test_numbers_that_make_no_sense(name: str, number: float) -> None:
+    with pytest.raises(ValueError, match=f"{name}={number}: expected a whole number"):
+        tiny_model(vectors_space(), None, **{name: number})
 
 
 # -- Bytes to numbers

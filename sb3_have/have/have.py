@@ -243,9 +243,9 @@ class HAVESAC(SAC):
             raise ValueError(f"local_coef={self.local_coef}: expected a number >= 0.")
         if not 0 <= self.modality_dropout < 1:
             raise ValueError(f"modality_dropout={self.modality_dropout}: expected a probability in [0, 1).")
-        for name in ("policy_delay", "target_update_interval"):
-            if not (isinstance(interval := getattr(self, name), int | np.integer) and interval >= 1):
-                raise ValueError(f"{name}={interval!r}: expected a whole number of updates, 1 or more.")
+        for name in ("buffer_size", "policy_delay", "target_update_interval"):
+            if not (isinstance(number := getattr(self, name), int | np.integer) and number >= 1):
+                raise ValueError(f"{name}={number!r}: expected a whole number, 1 or more.")
         check_random_shift(self.observation_space, self.random_shift, self.n_augmentations)
 
         # Store images, and transitions for n-step returns, in a ModalityReplayBuffer
